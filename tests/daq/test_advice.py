@@ -47,29 +47,29 @@ def test_estimators_that_disagree_name_method_and_residual() -> None:
 
 
 def test_a_misplaced_node_names_the_scan() -> None:
-    assert ("; `drivegain scan` shows the nodes of each bus") in ErrorParts.of(
-        NodeMisplaced(3, "can0", "can1")
-    ).error
+    node_misplaced = NodeMisplaced(3, "can0", "can1")
+    assert ("; `drivegain scan` shows the nodes of each bus") in ErrorParts.of(node_misplaced).error
 
 
 def test_mixed_parameters_name_the_rollback() -> None:
-    assert ("`drivegain rollback CELL --drives`") in ErrorParts.of(
-        ParametersMixed(("J1",), ("J2: silent",))
-    ).do
+    parameters_mixed = ParametersMixed(("J1",), ("J2: silent",))
+    assert ("`drivegain rollback CELL --drives`") in ErrorParts.of(parameters_mixed).do
 
 
 def test_a_payload_that_is_not_seen_is_looked_for_in_every_run_before_a_heavier_one_is_advised() -> (  # noqa: E501
     None
 ):
     """A body that was mounted in the run without load hides it as well as a light one does."""
-    remedy = ErrorParts.of(PayloadUnseen((40.0, 60.0), ("bare", "loaded"))).do
+    payload_unseen = PayloadUnseen((40.0, 60.0), ("bare", "loaded"))
+    remedy = ErrorParts.of(payload_unseen).do
     assert remedy.index("what was mounted in each run") < remedy.index("a heavier payload")
 
 
 def test_no_verb_is_told_to_give_an_effect_as_an_argument() -> None:
+    effect_not_installed = EffectNotInstalled("drag", "J2", "drags 0.2", installed="0.3")
     for error in (
         EffectNotInstalled("drag", "J2", "module drags"),
-        EffectNotInstalled("drag", "J2", "drags 0.2", installed="0.3"),
+        effect_not_installed,
         EffectNotInstalled("drag", "J2", "drags 0.2", other="others 1.0"),
     ):
         assert "own_effects" in str(error)

@@ -106,7 +106,8 @@ def test_an_argument_of_another_type_is_refused_by_name(
             continue  # what an effect lacks is said by `EffectRefused`
         with pytest.raises(daq.UsageError) as caught:
             getattr(lax, function)(**{**RIGHT[function], name: value})
-        assert caught.value.subject == f"{name} of {function}"
+        expected = f"{name} of {function}"
+        assert caught.value.subject == expected
         assert f"of type {type(value).__name__}" in caught.value.found
         assert caught.value.expected
     assert list(tmp_path.iterdir()) == []
@@ -166,8 +167,9 @@ def test_no_list_is_too_little_checked() -> None:
     ],
 )
 def test_a_request_of_other_things_is_refused(calibration: Any, now: Any, words: str) -> None:
+    target = RIGHT["propose"]["target"]
     with pytest.raises(daq.UsageError, match=words):
-        lax.propose(RIGHT["propose"]["target"], daq.Request(calibration, now))
+        lax.propose(target, daq.Request(calibration, now))
 
 
 OTHER_FIELDS = (
@@ -220,20 +222,23 @@ def test_a_field_of_a_file_target_of_another_type_is_named(
     name: str, value: Any, expected: str, tmp_path: Path
 ) -> None:
     assert {name for name, *_ in FILE_FIELDS} == RIGHT_FILE.keys()
-    _refuse(_target_with(daq.FileTarget, RIGHT_FILE, name, value), name, expected, "FileTarget")
+    target = _target_with(daq.FileTarget, RIGHT_FILE, name, value)
+    _refuse(target, name, expected, "FileTarget")
 
 
 @pytest.mark.parametrize(("name", "value", "expected"), DRIVE_FIELDS)
 def test_a_field_of_a_drive_target_of_another_type_is_named(
     name: str, value: Any, expected: str
 ) -> None:
+    cell = RIGHT["fit"]["cell"]
     right = {
-        "cell": RIGHT["fit"]["cell"],
+        "cell": cell,
         "network": _stand_in(CanopenNetwork),
         "saving": Saving.KNOWN,
     }
     assert {name for name, *_ in DRIVE_FIELDS} == right.keys()
-    _refuse(_target_with(daq.DriveTarget, right, name, value), name, expected, "DriveTarget")
+    target = _target_with(daq.DriveTarget, right, name, value)
+    _refuse(target, name, expected, "DriveTarget")
 
 
 RIGHT_FILE: dict[str, Any] = {
@@ -261,7 +266,8 @@ def test_the_file_target_of_something_else_than_a_cell_is_refused() -> None:
         with pytest.raises(daq.UsageError) as caught:
             lax.FileTarget.of(*arguments)
         assert caught.value.subject == f"{name} of FileTarget.of"
-    assert lax.FileTarget.of(cell, "other.yaml").file == Path("other.yaml")
+    file = lax.FileTarget.of(cell, "other.yaml").file
+    assert file == Path("other.yaml")
 
 
 def test_paths_may_be_texts(tmp_path: Path) -> None:

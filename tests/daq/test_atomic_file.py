@@ -39,7 +39,8 @@ def _access_list(user: int) -> bytes:
         (_MASK, READ | WRITE, _NO_ONE),
         (_OTHERS, 0, _NO_ONE),
     )
-    return struct.pack("<I", 2) + b"".join(struct.pack("<HHI", *entry) for entry in entries)
+    packed = struct.pack("<I", 2)
+    return packed + b"".join(struct.pack("<HHI", *entry) for entry in entries)
 
 
 def _set(path: Path, name: str, value: bytes) -> None:
@@ -66,7 +67,8 @@ def _rights(path: Path) -> dict[str, bytes | int]:
     attributes: dict[str, bytes | int] = {
         name: os.getxattr(path, name) for name in os.listxattr(path)
     }
-    return attributes | {"mode": stat.S_IMODE(path.stat().st_mode)}
+    s_imode = stat.S_IMODE(path.stat().st_mode)
+    return attributes | {"mode": s_imode}
 
 
 def test_mode_access_list_and_attributes_stay(file: Path) -> None:
@@ -162,7 +164,8 @@ def test_no_one_else_can_open_the_unfinished_copy_of_a_file_of_one_s_own(
     true = os.fchmod
 
     def fchmod(descriptor: int, mode: int) -> None:
-        modes.append(stat.S_IMODE(os.fstat(descriptor).st_mode))
+        st_mode = os.fstat(descriptor).st_mode
+        modes.append(stat.S_IMODE(st_mode))
         true(descriptor, mode)
 
     monkeypatch.setattr(os, "fchmod", fchmod)

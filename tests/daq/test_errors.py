@@ -78,12 +78,8 @@ def test_codes_are_those_of_the_command_line_contract() -> None:
 
 def test_an_error_carries_its_evidence() -> None:
     error = UsageError("here", found="this", expected="that", remedy="do so")
-    assert (error.subject, error.found, error.expected, error.remedy) == (
-        "here",
-        "this",
-        "that",
-        "do so",
-    )
+    expected = ("here", "this", "that", "do so")
+    assert (error.subject, error.found, error.expected, error.remedy) == expected
     assert str(error) == "here: found this; expected that; do so"
 
 

@@ -17,7 +17,8 @@ def test_a_name_of_one_s_own_choice_is_not_an_exception(
 ) -> None:
     monkeypatch.setenv(variable, "carol")
     assert login() == pwd.getpwuid(os.getuid()).pw_name
-    assert applier("Ada").names == ("Ada", login())
+    names = applier("Ada").names
+    assert names == ("Ada", login())
 
 
 def test_a_user_without_a_name_has_a_number(monkeypatch: pytest.MonkeyPatch) -> None:

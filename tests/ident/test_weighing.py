@@ -55,8 +55,9 @@ def _without_effects(calibration: Calibration) -> Calibration:
 def _scores(cell: WeighedCell, found: WeighedBody) -> FloatArray:
     mass = cell.body[-1]
     centre, std = found.centre_m
+    mass_difference_kg = found.mass_kg - mass
     return np.concatenate(
-        ([(found.mass_kg - mass) / found.mass_std_kg], (centre - cell.body[6:9] / mass) / std)
+        ([mass_difference_kg / found.mass_std_kg], (centre - cell.body[6:9] / mass) / std)
     )
 
 
@@ -76,14 +77,16 @@ def test_errors_are_as_large_as_their_sigma(
             for bare in ([], [cell.bare])
         ]
     )
-    assert 0.5 < np.sqrt(np.mean(scores**2)) < 1.6
+    rms_scores = np.sqrt(np.mean(scores**2))
+    assert 0.5 < rms_scores < 1.6
     assert np.abs(scores).max() < 4.0
 
 
 def test_without_the_effects_sigma_is_wide_and_the_residual_large(
     cells: tuple[WeighedCell, ...], rows: tuple[RowsToWeigh, RowsToWeigh]
 ) -> None:
-    whole = weigh_rows(cells[0].calibration, rows[1])
+    calibration = cells[0].calibration
+    whole = weigh_rows(calibration, rows[1])
     without = weigh_rows(_without_effects(cells[0].calibration), rows[1])
     assert without.moves_covariance[-1, -1] > 1.3**2 * whole.moves_covariance[-1, -1]
     assert without.error.axes[AXIS] > 1.3 * whole.error.axes[AXIS]
@@ -103,13 +106,15 @@ def test_an_error_of_the_calibration_is_in_sigma_as_it_is_in_the_body(
     rng = np.random.default_rng(5)
     error = 1e-4 * rng.standard_normal(len(values)) * np.maximum(np.abs(values), 1e-2)
     root = tuple((float(value), *([0.0] * index)) for index, value in enumerate(error))
-    certain = weigh_rows(replace(calibration, covariance_factor=root), rows[beside])
+    changed_calibration = replace(calibration, covariance_factor=root)
+    certain = weigh_rows(changed_calibration, rows[beside])
     moved = _changed(calibration, values + error)
     shift = weigh_rows(moved, rows[beside]).values - weigh_rows(calibration, rows[beside]).values
-    share = np.diag(certain.covariance - certain.moves_covariance)
-    assert np.sqrt(np.abs(share)) == pytest.approx(
-        np.abs(shift), rel=0.03, abs=0.03 * float(np.abs(shift).max())
-    )
+    covariance_difference = certain.covariance - certain.moves_covariance
+    share = np.diag(covariance_difference)
+    largest_absolute_shift = float(np.abs(shift).max())
+    share_root = np.sqrt(np.abs(share))
+    assert share_root == pytest.approx(np.abs(shift), rel=0.03, abs=0.03 * largest_absolute_shift)
 
 
 @pytest.mark.parametrize("beside", [0, 1])
@@ -128,17 +133,19 @@ def test_the_tolerance_of_the_reference_mass_is_in_sigma_as_a_wrong_mass_is_in_t
     tolerance_kg = (factor - 1.0) * reference.mass_kg
     heavier = weighed_cell(small_truth, 0, mass_factor=factor).calibration
     shift = weigh_rows(heavier, rows[beside]).values - weigh_rows(calibration, rows[beside]).values
-    tolerant = replace(calibration, payload_mass=(reference.weighed_to(tolerance_kg),))
-    earlier = replace(
-        calibration, payload_mass=(replace(tolerant.payload_mass[0], parameters_per_kg=()),)
-    )
+    payload_mass = (reference.weighed_to(tolerance_kg),)
+    tolerant = replace(calibration, payload_mass=payload_mass)
+    changed_payload_mass = replace(tolerant.payload_mass[0], parameters_per_kg=())
+    earlier = replace(calibration, payload_mass=(changed_payload_mass,))
     exact = weigh_rows(calibration, rows[beside])
     for known in (tolerant, earlier):
         found = weigh_rows(known, rows[beside])
         added = found.covariance - exact.covariance
         assert found.reference_covariance == pytest.approx(added)
-        assert np.sqrt(np.diag(added)) == pytest.approx(
-            np.abs(shift), rel=0.05, abs=0.02 * np.abs(shift).max()
+        added_diagonal_root = np.sqrt(np.diag(added))
+        largest_absolute_shift = np.abs(shift).max()
+        assert added_diagonal_root == pytest.approx(
+            np.abs(shift), rel=0.05, abs=0.02 * largest_absolute_shift
         )
         assert found.mass_reference_std_kg == pytest.approx(
             tolerance_kg / reference.mass_kg * exact.mass_kg, rel=0.02
@@ -152,8 +159,10 @@ def test_a_payload_of_exact_mass_hides_no_tolerance_of_another(
     calibration = cells[0].calibration
     (reference,) = calibration.payload_mass
     exact = reference.weighed_to(0.0)
-    tolerant = reference.weighed_to(0.01 * reference.mass_kg)
-    alone = weigh_rows(replace(calibration, payload_mass=(tolerant,)), rows[0])
+    tolerance_kg = 0.01 * reference.mass_kg
+    tolerant = reference.weighed_to(tolerance_kg)
+    changed_calibration = replace(calibration, payload_mass=(tolerant,))
+    alone = weigh_rows(changed_calibration, rows[0])
     for both in ((exact, tolerant), (tolerant, exact)):
         found = weigh_rows(replace(calibration, payload_mass=both), rows[0])
         assert found.reference_covariance == pytest.approx(alone.reference_covariance)
@@ -164,10 +173,12 @@ def _changed(calibration: Calibration, values: FloatArray) -> Calibration:
     count = len(calibration.gains)
     pairs = zip(calibration.gains, values[:count], strict=True)
     rest = zip(calibration.parameters, values[count:], strict=True)
+    gains = tuple(replace(gain, value=float(value)) for gain, value in pairs)
+    parameters = tuple(replace(parameter, value=float(value)) for parameter, value in rest)
     return replace(
         calibration,
-        gains=tuple(replace(gain, value=float(value)) for gain, value in pairs),
-        parameters=tuple(replace(parameter, value=float(value)) for parameter, value in rest),
+        gains=gains,
+        parameters=parameters,
     )
 
 
@@ -178,12 +189,10 @@ def test_a_common_error_of_the_gains_scales_the_body_and_leaves_its_centre(
     the scatter of the moves is left alone.
     """
     plain = _without_effects(cells[0].calibration)
-    scaled = replace(
-        plain, gains=tuple(replace(gain, value=1.05 * gain.value) for gain in plain.gains)
-    )
-    uncertain = replace(
-        plain, gains=tuple(replace(gain, std=0.02 * abs(gain.value)) for gain in plain.gains)
-    )
+    gains = tuple(replace(gain, value=1.05 * gain.value) for gain in plain.gains)
+    scaled = replace(plain, gains=gains)
+    changed_gains = tuple(replace(gain, std=0.02 * abs(gain.value)) for gain in plain.gains)
+    uncertain = replace(plain, gains=changed_gains)
     exact, heavier, found = (weigh_rows(one, rows[1]) for one in (plain, scaled, uncertain))
     assert heavier.mass_kg == pytest.approx(1.05 * exact.mass_kg, rel=1e-3)
     assert heavier.centre_m[0] == pytest.approx(exact.centre_m[0], abs=1e-5)
@@ -197,7 +206,9 @@ def test_what_the_logs_say_of_their_payload_is_ignored(
 ) -> None:
     cell = cells[1]
     calibration = _without_effects(cell.calibration)
-    runs = cell.loaded, replace(cell.loaded, payload=Payload("other", "elsewhere", {"m": 99.0}))
+    payload = Payload("other", "elsewhere", {"m": 99.0})
+    changed_loaded = replace(cell.loaded, payload=payload)
+    runs = cell.loaded, changed_loaded
     first, second = (
         weigh(calibration, small_truth.model, [run], cell.conditioning) for run in runs
     )
@@ -212,24 +223,30 @@ def test_a_swing_of_the_last_joint_shows_a_part_and_says_what_would_show_the_res
     rng = np.random.default_rng(1)
     calm = _only_last(small_truth, noisy_run(small_truth, "swing", rng, None, 24.0))
     loaded = _recorded(small_truth, calm, cell.body)
-    found = weigh(_without_effects(cell.calibration), model, [loaded], cell.conditioning)
+    calibration = _without_effects(cell.calibration)
+    found = weigh(calibration, model, [loaded], cell.conditioning)
     seen = dict(zip(LINK_PARAMETERS, found.identifiable.tolist(), strict=True))
     assert not seen["m"]
-    assert np.isnan(found.mass_kg) == np.isnan(found.centre_m[0]).all()
+    expected = np.isnan(found.centre_m[0]).all()
+    assert np.isnan(found.mass_kg) == expected
     assert seen["mx"] or seen["mz"]  # the weight's lever about the last joint
 
     def extra(words: str, run: Run) -> ExtraMoves:
         q = run.position_rad[::5]
         rate_hz = run.rate_hz / 5.0
         velocity = np.gradient(q, axis=0) * rate_hz
-        motion = Motion(q, velocity, np.gradient(velocity, axis=0) * rate_hz)
-        return ExtraMoves(words, 24.0, Excitation(motion, (np.abs(velocity) > 0.03).T))
+        velocity_gradient = np.gradient(velocity, axis=0)
+        acceleration_rad_s2 = velocity_gradient * rate_hz
+        motion = Motion(q, velocity, acceleration_rad_s2)
+        excitation = Excitation(motion, (np.abs(velocity) > 0.03).T)
+        return ExtraMoves(words, 24.0, excitation)
 
     everything = extra("all axes", cell.loaded)
     same = extra("more of the same", calm)
     helped = {one.name: one for one in moves_that_help(found, [same, everything])}
     assert helped["m"].words == "all axes"
-    assert 2.0 * helped["m"].std < cell.body[-1]
+    std = helped["m"].std
+    assert 2.0 * std < cell.body[-1]
     assert "m" not in {one.name for one in moves_that_help(found, [same])}
     assert moves_that_help(found, []) == ()
 
@@ -243,15 +260,18 @@ def _only_last(truth: Truth, run: Run) -> Run:
 def _recorded(truth: Truth, run: Run, body: FloatArray) -> Run:
     """The run with the currents that its motion needs."""
     rate_hz = run.rate_hz
-    velocity = np.gradient(run.position_rad, axis=0) * rate_hz
-    motion = Motion(run.position_rad, velocity, np.gradient(velocity, axis=0) * rate_hz)
+    position_rad_gradient = np.gradient(run.position_rad, axis=0)
+    velocity = position_rad_gradient * rate_hz
+    velocity_gradient = np.gradient(velocity, axis=0)
+    acceleration_rad_s2 = velocity_gradient * rate_hz
+    motion = Motion(run.position_rad, velocity, acceleration_rad_s2)
     parameters = truth.parameters.copy()
     parameters[truth.model.flange] += body
     torque = truth.model.torques(motion, parameters)[2]
-    noise = 0.02 * np.random.default_rng(2).standard_normal(torque.shape)
-    return replace(
-        run, current_a=(truth.model.drive_train.to_motor @ torque / truth.gains[:, None] + noise).T
-    )
+    rng = np.random.default_rng(2)
+    noise = 0.02 * rng.standard_normal(torque.shape)
+    to_motor = truth.model.drive_train.to_motor
+    return replace(run, current_a=(to_motor @ torque / truth.gains[:, None] + noise).T)
 
 
 def test_too_little_is_refused(small_truth: Truth, cells: tuple[WeighedCell, ...]) -> None:
@@ -281,9 +301,9 @@ def test_centre_and_inertia_are_those_of_the_ten(seed: int) -> None:
     upper = np.triu_indices(3)
     body = body_of(ten)
     near = body_of(ten + step)
-    frame = Place(
-        0, np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), np.array([0.4, 0.1, 0.0])
-    )
+    rotation = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    translation_m = np.array([0.4, 0.1, 0.0])
+    frame = Place(0, rotation, translation_m)
     placed, placed_std = found.centre_in(frame)
     x, y, z = body.centre_m
     assert placed == pytest.approx([y - 0.1, 0.4 - x, z])  # a quarter turn about z
@@ -292,10 +312,10 @@ def test_centre_and_inertia_are_those_of_the_ten(seed: int) -> None:
     assert planar.centre_in(frame)[0] == pytest.approx([y - 0.1, 0.4 - x, np.nan], nan_ok=True)
     assert centre == pytest.approx(body.centre_m)
     assert inertia == pytest.approx(body.inertia_kg_m2[upper], abs=1e-12)
-    assert centre_std == pytest.approx(np.abs(near.centre_m - body.centre_m), rel=1e-2, abs=1e-9)
-    assert inertia_std == pytest.approx(
-        np.abs(near.inertia_kg_m2 - body.inertia_kg_m2)[upper], rel=1e-2, abs=1e-9
-    )
+    centre_difference_m = np.abs(near.centre_m - body.centre_m)
+    assert centre_std == pytest.approx(centre_difference_m, rel=1e-2, abs=1e-9)
+    inertia_difference_kg_m2 = np.abs(near.inertia_kg_m2 - body.inertia_kg_m2)
+    assert inertia_std == pytest.approx(inertia_difference_kg_m2[upper], rel=1e-2, abs=1e-9)
     lost = replace(found, values=np.where(np.arange(10) == 6, np.nan, ten))
     assert np.isnan(lost.centre_m[0]).tolist() == [True, False, False]
 
@@ -310,9 +330,8 @@ def test_a_parameter_with_a_long_lever_is_identified_though_a_compact_body_has_l
         std = np.where(np.isnan(ten), np.nan, 0.01)
         std[5] = std_of_izz
         covariance = np.diag(std**2)
-        body = WeighedBody(
-            ten, covariance, covariance, True, 9, RelativeError((), 0.0), Scale.__new__(Scale)
-        )
+        error = RelativeError((), 0.0)
+        body = WeighedBody(ten, covariance, covariance, True, 9, error, Scale.__new__(Scale))
         return [
             name for name, known in zip(LINK_PARAMETERS, body.identifiable, strict=True) if known
         ]
@@ -333,9 +352,8 @@ def test_a_mass_is_identified_to_a_tenth_of_itself_and_nothing_is_small_beside_a
     std = np.full(10, 1e-4 * mass_kg)
     std[9] = share * mass_kg
     covariance = np.diag(std**2)
-    body = WeighedBody(
-        ten, covariance, covariance, True, 9, RelativeError((), 0.0), Scale.__new__(Scale)
-    )
+    error = RelativeError((), 0.0)
+    body = WeighedBody(ten, covariance, covariance, True, 9, error, Scale.__new__(Scale))
     known = body.identifiable
     assert known[9] == (share <= KNOWN)
     least = body.size

@@ -165,7 +165,8 @@ def test_angles_in_other_units_are_named_with_how_far_the_joint_turns(
         ident.identify(small_truth.model, runs)
     robot = small_truth.model.robot
     joints = tuple(replace(joint, travel=None) for joint in robot.joints)
-    without_limits = replace(small_truth.model, robot=replace(robot, joints=joints))
+    changed_robot = replace(robot, joints=joints)
+    without_limits = replace(small_truth.model, robot=changed_robot)
     words = (
         r"found q\d turning by \d+\.?\d* rad in run '\w+'; expected a joint's angle in rad: "
         r"are these degrees"
@@ -434,7 +435,10 @@ def test_runs_of_different_logs_may_have_one_name(
 ) -> None:
     """Sessions in folders of their own give their logs the same names."""
     bare, loaded = short
-    of_logs = [replace(bare, digest="a" * 64), replace(loaded, name=bare.name, digest="b" * 64)]
+    digest = "b" * 64
+    changed_loaded = replace(loaded, name=bare.name, digest=digest)
+    changed_bare = replace(bare, digest="a" * 64)
+    of_logs = [changed_bare, changed_loaded]
     same = ident.identify(small_truth.model, of_logs)
     assert np.array_equal(
         same.estimate.gains, ident.identify(small_truth.model, short).estimate.gains
@@ -462,7 +466,9 @@ def test_lists_and_arrays_of_objects_or_without_a_masked_value_are_as_good(
     train = DRIVE_TRAIN
     expected = ident.differentiate(run, train)
     for kind in (np.ma.masked_array, lambda values: values.astype(object), np.ndarray.tolist):
-        same = ident.differentiate(replace(run, current_a=kind(run.current_a)), train)
+        current_a = kind(run.current_a)
+        changed_run = replace(run, current_a=current_a)
+        same = ident.differentiate(changed_run, train)
         assert np.array_equal(same.current_a, expected.current_a)
 
 
@@ -473,6 +479,7 @@ def arguments(small_truth: Truth, short: tuple[ident.Run, ident.Run]) -> dict[st
     axes = ("J1", "J2", "J3")
     calibration = ident.calibration_of(found, axes, found.estimate.gains)
     data = ident.differentiate(short[0], small_truth.model.drive_train)
+    current_a = short[0].current_a
     return {
         "calibration": calibration,
         "model": small_truth.model,
@@ -481,7 +488,7 @@ def arguments(small_truth: Truth, short: tuple[ident.Run, ident.Run]) -> dict[st
         "runs": short,
         "loaded": short[1:],
         "quiet": short[:1],
-        "current_a": short[0].current_a,
+        "current_a": current_a,
         "found": found,
         "axes": axes,
         "nameplate": found.estimate.gains,
@@ -521,11 +528,8 @@ def test_no_public_function_has_a_traceback_for_an_argument_of_another_type(
     arguments: dict[str, Any], function: str
 ) -> None:
     called = getattr(lax, function)
-    needed = [
-        one.name
-        for one in inspect.signature(called).parameters.values()
-        if one.default is one.empty
-    ]
+    parameters = inspect.signature(called).parameters
+    needed = [one.name for one in parameters.values() if one.default is one.empty]
     if function != "gather":
         right = [arguments[name] for name in needed]
     else:
@@ -589,14 +593,15 @@ def test_the_tolerance_of_a_payloads_mass_is_that_of_a_cell_file(
     small_truth: Truth, short: tuple[ident.Run, ident.Run], arguments: dict[str, Any]
 ) -> None:
     declared = replace(MOUNTED, mass_tolerance_kg=0.02)
-    found = ident.identify(
-        small_truth.model, [short[0], replace(short[1], payload=declared)], ident.Conditioning()
-    )
+    changed_short = replace(short[1], payload=declared)
+    found = ident.identify(small_truth.model, [short[0], changed_short], ident.Conditioning())
     calibration = ident.calibration_of(found, arguments["axes"], arguments["nameplate"])
     # What `daq.calibration_of` does with `mass_tolerance_kg` of the cell file
-    by_cell_file = [one.weighed_to(0.02) for one in arguments["calibration"].payload_mass]
+    payload_mass = arguments["calibration"].payload_mass
+    by_cell_file = [one.weighed_to(0.02) for one in payload_mass]
     assert list(calibration.payload_mass) == by_cell_file
-    assert calibration.payload_mass[0].gains[1].tolerance_std > 0.0
+    gains = calibration.payload_mass[0].gains
+    assert gains[1].tolerance_std > 0.0
     body = ident.weigh(calibration, small_truth.model, short[1:])
     assert body.mass_reference_std_kg == pytest.approx(0.02, rel=0.1)
     exact = ident.weigh(arguments["calibration"], small_truth.model, short[1:])
@@ -646,7 +651,8 @@ def test_a_seed_in_the_place_of_a_generator_and_one_effect_are_corrected(
 
 
 def test_gains_by_name_are_told_how_to_become_a_list(arguments: dict[str, Any]) -> None:
-    axes = [joint.name for joint in arguments["model"].robot.axes]
+    robot = arguments["model"].robot
+    axes = [joint.name for joint in robot.axes]
     by_name = dict.fromkeys(axes, 1.0)
     with pytest.raises(
         ident.ModelError, match=r"nameplate is a dictionary .*write \[nameplate\[name\] for name in"

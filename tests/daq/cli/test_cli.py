@@ -43,11 +43,13 @@ def test_every_help_is_whole_and_ends_with_an_example_to_copy(
         shown = next((kind for kind in kinds if kind.name == command[-1]), verb)
         assert shown.example.startswith("drivegain " + " ".join(command))
         copied = output.rpartition("Example:")[2].replace("\\\n", " ")
-        assert copied.split() == shown.example.replace("CELL", str(cell_here())).split()
+        changed_example = shown.example.replace("CELL", str(cell_here()))
+        assert copied.split() == changed_example.split()
         # Nothing of a help text is taken for markup: units are in brackets.
         reported = _squeezed(output)
         assert max(map(len, output.splitlines())) <= 80
-        for parameter in inspect.signature(shown.function(), eval_str=True).parameters.values():
+        parameters = inspect.signature(shown.function(), eval_str=True).parameters
+        for parameter in parameters.values():
             (option,) = parameter.annotation.__metadata__
             assert _squeezed(option.help) in reported
             assert set(option.help.split()) <= set(output.split())  # no word is cut
@@ -57,7 +59,8 @@ def test_the_list_shows_every_verb_with_its_whole_summary(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     assert main(["--help"]) == 0
-    lines = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
+    printed = capsys.readouterr().out
+    lines = [" ".join(line.split()) for line in printed.splitlines()]
     for verb in VERBS:
         assert f"{verb.name} {verb.summary}" in lines
 
@@ -73,9 +76,8 @@ def test_an_earlier_name_is_the_same_verb_and_is_not_listed(
     assert capsys.readouterr().out == shown
     assert f"`{earlier}`, goes on working" in _squeezed_lines(shown)
     assert main(["--help"]) == 0
-    listed = {
-        line.split()[0] for line in capsys.readouterr().out.splitlines() if line.startswith("  ")
-    }
+    lines = capsys.readouterr().out.splitlines()
+    listed = {line.split()[0] for line in lines if line.startswith("  ")}
     assert name in listed
     assert earlier not in listed
 
@@ -90,7 +92,8 @@ def test_every_job_of_the_help_has_its_verbs(capsys: pytest.CaptureFixture[str])
     for job in Job:
         (section,) = (one for one in sections if one.startswith(f"{job.value}:"))
         named = [line.split()[0] for line in section.splitlines()[1:]]
-        assert named == [verb.name for verb in BY_JOB[job]]
+        expected = [verb.name for verb in BY_JOB[job]]
+        assert named == expected
 
 
 def test_an_example_chooses_none_of_several_cell_files(
@@ -115,10 +118,14 @@ def test_an_example_uses_the_cell_file_of_the_folder(
     assert main(["init", "other-cells/lathe"]) == 0
     assert main(["init", example]) == 0
     assert cell_here().is_file()
-    assert [*cells_in(Path(), "press-4")] == [Path("press-4/cells/press-4.yaml")]
-    monkeypatch.chdir(tmp_path / "other-cells" / "lathe")
+    cells = cells_in(Path(), "press-4")
+    assert [*cells] == [Path("press-4/cells/press-4.yaml")]
+    lathe_folder = tmp_path / "other-cells" / "lathe"
+    monkeypatch.chdir(lathe_folder)
     assert main(["scan", "-h"]) == 0
-    assert capsys.readouterr().out.splitlines()[-1].strip() == "drivegain scan cells/lathe.yaml"
+    lines = capsys.readouterr().out.splitlines()
+    last_line = lines[-1]
+    assert last_line.strip() == "drivegain scan cells/lathe.yaml"
 
 
 def test_no_verb_waits_for_a_pipe_that_is_named_like_a_cell_file(
@@ -159,7 +166,8 @@ def test_an_option_without_its_value_is_an_error_of_the_usual_form(
                 failure = json.loads(capsys.readouterr().err)
                 assert (failure["kind"], failure["exit_code"]) == ("UsageError", ExitCode.USAGE)
                 assert option in failure["found"]
-                assert failure["do"] == f"`drivegain {verb.name} --help` explains it"
+                expected = f"`drivegain {verb.name} --help` explains it"
+                assert failure["do"] == expected
 
 
 def test_a_value_of_the_wrong_type_is_shown(capsys: pytest.CaptureFixture[str]) -> None:
@@ -192,17 +200,29 @@ def test_progress_in_a_pipe_is_a_whole_line_a_step(capsys: pytest.CaptureFixture
         stepper.progress(3, 10, "moves")
         assert capsys.readouterr().err == ""
         stepper.step("identify")
-        assert capsys.readouterr().err == f"{title} (0 s)\n"
+        error_output = capsys.readouterr().err
+        assert error_output == f"{title} (0 s)\n"
     assert capsys.readouterr().err == "identify (0 s)\n"
 
 
 def test_examples_name_files_that_other_examples_make() -> None:
-    examples = [kind.example for verb in VERBS for kind in (verb, *verb.kinds)]
-    made = {value for one in examples for value in re.findall(r"--(?:out|report) (\S+)", one)}
-    used = {word for one in examples for word in one.split() if re.search(r"\.(mcap|yaml)$", word)}
+    examples = []
+    for verb in VERBS:
+        for kind in (verb, *verb.kinds):
+            examples.append(kind.example)
+    made = set()
+    for one in examples:
+        for value in re.findall(r"--(?:out|report) (\S+)", one):
+            made.add(value)
+    used = set()
+    for one in examples:
+        for word in one.split():
+            if re.search(r"\.(mcap|yaml)$", word):
+                used.add(word)
     # Made by `record` with other options, as in the guide, and by `init`.
     of_init = {"press-4/imports/press-4.yaml", "press-4/cells/press-4.yaml"}
-    assert used - made == {"unloaded.mcap", "held-out.mcap", *of_init}
+    expected = {"unloaded.mcap", "held-out.mcap", *of_init}
+    assert used - made == expected
 
 
 @pytest.mark.parametrize("width", [40, 78])
@@ -226,7 +246,8 @@ def test_the_table_of_exit_codes_is_that_of_the_code(checkout: Path) -> None:
         for first, _, last in [row.partition(" to ")]
         for code in _span(first, last)
     ]
-    assert sorted(named) == sorted(code.value for code in ExitCode)
+    sorted_codes = sorted(code.value for code in ExitCode)
+    assert sorted(named) == sorted_codes
     for code in ExitCode:
         word = {ExitCode.OK: "ok"}.get(code, code.name.lower().replace("_", " ").split()[-1])
         assert word in page or code in range(10, 15)
@@ -234,10 +255,13 @@ def test_the_table_of_exit_codes_is_that_of_the_code(checkout: Path) -> None:
 
 def test_the_help_names_every_exit_code(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--help"]) == 0
-    said = " ".join(capsys.readouterr().out.split())
+    printed = capsys.readouterr().out
+    said = " ".join(printed.split())
     listed = said[said.index("Exit codes:") :].replace("10 to 14", "10 11 12 13 14")
-    numbers = {int(number) for number in re.findall(r"\d+", listed)}
-    assert numbers == {code.value for code in ExitCode}
+    matches = re.findall(r"\d+", listed)
+    numbers = {int(number) for number in matches}
+    expected = {code.value for code in ExitCode}
+    assert numbers == expected
 
 
 def _span(first: str, last: str) -> range:
@@ -246,12 +270,14 @@ def _span(first: str, last: str) -> range:
 
 def test_a_unit_in_a_help_text_is_shown(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["scan", "--help"]) == 0
-    assert "How long to wait for answers [s]." in " ".join(capsys.readouterr().out.split())
+    printed = capsys.readouterr().out
+    assert "How long to wait for answers [s]." in " ".join(printed.split())
 
 
 def test_a_misspelt_verb_is_put_right(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["recrod"]) == ExitCode.USAGE
-    assert "Did you mean 'record'?" in " ".join(capsys.readouterr().err.split())
+    error_output = capsys.readouterr().err
+    assert "Did you mean 'record'?" in " ".join(error_output.split())
 
 
 @pytest.mark.parametrize("arguments", [["--help"], ["--version"]])
@@ -270,13 +296,11 @@ def test_light_work_brings_no_mathematics(checkout: Path, arguments: list[str]) 
 def test_what_was_written_is_reported_line_by_line(tmp_path: Path) -> None:
     out = io.StringIO()
     (tmp_path / "[s] pictures").mkdir()
-    say_written(
-        Console(file=out, soft_wrap=True), None, Path("cali\x1b.yaml"), tmp_path / "[s] pictures"
-    )
-    assert out.getvalue().splitlines() == [
-        "Written: cali\\x1b.yaml",
-        f"Written: {tmp_path}/[s] pictures/",
-    ]
+    console = Console(file=out, soft_wrap=True)
+    say_written(console, None, Path("cali\x1b.yaml"), tmp_path / "[s] pictures")
+    lines = out.getvalue().splitlines()
+    expected = ["Written: cali\\x1b.yaml", f"Written: {tmp_path}/[s] pictures/"]
+    assert lines == expected
 
 
 def _squeezed(text: str) -> str:
@@ -304,7 +328,8 @@ def test_wrong_usage_is_exit_code_2(
     assert main([*arguments, "--json"]) == 2
     output = capsys.readouterr()
     assert output.out == ""
-    assert named in json.loads(output.err)["found"]
+    document = json.loads(output.err)
+    assert named in document["found"]
 
 
 def test_version(capsys: pytest.CaptureFixture[str]) -> None:
@@ -315,12 +340,14 @@ def test_version(capsys: pytest.CaptureFixture[str]) -> None:
 @pytest.fixture
 def log(checkout: Path, tmp_path: Path) -> Path:
     """A loaded run of the demo cell."""
+    cell_event = CellEvent(START_NS, None, EventKind.MOVE_START, 1, "")
     events = (
-        CellEvent(START_NS, None, EventKind.MOVE_START, 1, ""),
+        cell_event,
         CellEvent(START_NS, 2, EventKind.EMCY, 0x2310, "\x1b[2Jcurrent"),
     )
+    path = tmp_path / "a.mcap"
     return write(
-        tmp_path / "a.mcap",
+        path,
         demo_content(checkout, DISC),
         samples([[k] * 6 for k in range(500)]),
         events,
@@ -334,11 +361,14 @@ def test_info_json_is_one_object_and_nothing_else(
     output = capsys.readouterr()
     assert output.err == ""
     found = json.loads(output.out)
-    assert (found["role"], found["payload"]["known"]) == ("loaded", {"m": 4.59})
+    expected = ("loaded", {"m": 4.59})
+    known = found["payload"]["known"]
+    assert (found["role"], known) == expected
     assert (found["samples"], found["duration_s"], found["rate_hz"]) == (500, 0.5, 1000.0)
     assert (found["moves"], found["lost_cycles"], found["valid"]) == (1, 0, True)
     assert found["axes"] == ["J1", "J2", "J3", "J4", "J5", "J6"]
-    assert [event["code"] for event in found["events"]] == [0x2310]
+    codes = [event["code"] for event in found["events"]]
+    assert codes == [0x2310]
     assert len(found["sha256"]) == len(found["cell_sha256"]) == 64
 
 
@@ -402,7 +432,8 @@ def test_init_makes_a_cell_that_can_be_read(
     printed = capsys.readouterr()
     assert next_step(printed.err) == "scan"
     written = {Path(line) for line in printed.out.splitlines()}
-    assert written == {path for path in folder.rglob("*") if path.is_file()}
+    expected = {path for path in folder.rglob("*") if path.is_file()}
+    assert written == expected
     cell = load_cell(folder / "cells/press-4.yaml")
     assert cell.name == "press-4"
     assert [(bus.interface, bus.channel) for bus in cell.buses] == [("socketcan", "can0")]
@@ -426,14 +457,14 @@ def test_init_makes_a_cell_that_can_be_read(
 
 def test_init_for_the_simulated_cell_changes_bus_and_sampling_alone(tmp_path: Path) -> None:
     for folder, option in (("real", []), ("simulated", ["--simulated"])):
-        assert main(["init", str(tmp_path / folder / "press-4"), *option]) == 0
+        press_4_folder = tmp_path / folder / "press-4"
+        assert main(["init", str(press_4_folder), *option]) == 0
     real, simulated = (
         tmp_path / folder / "press-4/cells/press-4.yaml" for folder in ("real", "simulated")
     )
     cell = load_cell(simulated)
-    assert [(bus.interface, bus.channel, bus.host, bus.port) for bus in cell.buses] == [
-        ("socketcand", "can0", "127.0.0.1", 29536)
-    ]
+    expected = [("socketcand", "can0", "127.0.0.1", 29536)]
+    assert [(bus.interface, bus.channel, bus.host, bus.port) for bus in cell.buses] == expected
     assert cell.sync is not None
     assert cell.sync.pacing is PacingMode.LOCKSTEP
     one, other = (yaml.safe_load(path.read_text(encoding="utf-8")) for path in (real, simulated))
@@ -445,7 +476,8 @@ def test_init_overwrites_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[s
     (tmp_path / "press-4/notes.txt").write_text("mine", encoding="utf-8")
     assert main(["init", str(tmp_path / "press-4")]) == 2
     assert "something in it" in capsys.readouterr().err
-    assert [path.name for path in (tmp_path / "press-4").iterdir()] == ["notes.txt"]
+    files = (tmp_path / "press-4").iterdir()
+    assert [path.name for path in files] == ["notes.txt"]
 
 
 def test_init_into_an_empty_folder(tmp_path: Path) -> None:

@@ -111,7 +111,7 @@ def test_each_shell_has_its_script_and_every_verb(shell_name: str, checkout: Pat
         },
         **{"_TYPER_COMPLETE_ARGS": "drivegain ", "_TYPER_COMPLETE_FISH_ACTION": "get-args"},
     }
-    found = subprocess.run(run, capture_output=True, text=True, env=asked, check=True).stdout
-    assert set(
-        re.findall(r"^\W*([a-z-]+)", found.replace("_arguments '*: :((", ""), re.MULTILINE)
-    ) >= {verb.name for verb in VERBS}
+    completed = subprocess.run(run, capture_output=True, text=True, env=asked, check=True)
+    found = completed.stdout
+    matches = re.findall(r"^\W*([a-z-]+)", found.replace("_arguments '*: :((", ""), re.MULTILINE)
+    assert set(matches) >= {verb.name for verb in VERBS}

@@ -42,7 +42,9 @@ def cell(request: pytest.FixtureRequest, tmp_path: Path) -> Cell:
 
 @pytest.fixture
 def simulation(cell: Cell) -> Iterator[SimulatedCell]:
-    with simulated(BusAddress("virtual", cell.buses[0].channel)) as running:
+    channel = cell.buses[0].channel
+    address = BusAddress("virtual", channel)
+    with simulated(address) as running:
         yield running
 
 
@@ -107,17 +109,19 @@ def test_look_write_and_go_back(
     ]
     evidence = read(cell.history.audit)[0].details
     assert evidence["configuration_sha256"] == demo_calibration().configuration_sha256
-    assert evidence["calibration"] == {
+    expected = {
         "file": str(Path("calibration.yaml").absolute()),
         "sha256": hashlib.sha256(encode_calibration(demo_calibration())).hexdigest(),
         "cell": "demo",
         "created": demo_calibration().created,
         "software": demo_calibration().software,
     }
+    assert evidence["calibration"] == expected
     ledger = Ledger.of(cell)
     assert ledger is not None
     history = read_history(ledger)
-    assert [event.target for event in history.events] == ["drives of cell demo"] * 2
+    targets = [event.target for event in history.events]
+    assert targets == ["drives of cell demo"] * 2
     assert history.in_force() is None
     # The two entries that record how the writes ended.
     assert {event.audit for event in history.events} == {
@@ -148,7 +152,8 @@ def test_a_program_gets_all_of_it(cell: Cell, capsys: pytest.CaptureFixture[str]
         text = capsys.readouterr().out
         document = json.loads(text)
         DriveRollback.model_validate_json(text)
-        assert (document["source"], document["restored"]) == (written["record"], yes)
+        expected = (written["record"], yes)
+        assert (document["source"], document["restored"]) == expected
         assert document["changes"][3] == {
             "axis": "J4",
             "object": "2003h:01",
@@ -167,14 +172,16 @@ def test_a_failed_check_is_reported_and_nothing_written(
     as_json: bool,
 ) -> None:
     calibration = demo_calibration()
-    far = replace(
-        calibration, gains=(replace(calibration.gains[0], std=5.0), *calibration.gains[1:])
-    )
+    changed_gain = replace(calibration.gains[0], std=5.0)
+    gains = (changed_gain, *calibration.gains[1:])
+    far = replace(calibration, gains=gains)
     with pytest.raises(CalibrationRefused, match="J1: found σ"):
         apply_in_drives(cell, calibration=far, yes=yes, as_json=as_json)
     shown = capsys.readouterr().out
     if as_json:
-        assert [one["gate"] for one in json.loads(shown)["refusals"]] == ["uncertainty"]
+        refusals = json.loads(shown)["refusals"]
+        gates = [one["gate"] for one in refusals]
+        assert gates == ["uncertainty"]
     assert [entered_gain(node) for node in simulation.nodes] == pytest.approx(NAMEPLATE)
 
 

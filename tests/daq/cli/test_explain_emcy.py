@@ -40,9 +40,11 @@ def test_codes_of_the_standards_and_of_makers(
     assert words in capsys.readouterr().out
     assert main(["explain-emcy", code, "--json"]) == ExitCode.OK
     document = json.loads(capsys.readouterr().out)
-    assert (document["code"], document["standard"]) == (read_code(code), standard)
+    expected = (read_code(code), standard)
+    assert (document["code"], document["standard"]) == expected
     assert words in document["text"]
-    assert document["remedy"] == for_command_line(remedy_of(read_code(code)))
+    text = remedy_of(read_code(code))
+    assert document["remedy"] == for_command_line(text)
     assert document["remedy"].endswith(
         "then reset the fault with `drivegain scan CELL --reset-faults`"
     )

@@ -44,9 +44,9 @@ def test_every_error_of_drivers_and_of_the_science_has_a_remedy(kind: type[Excep
         object.__setattr__(error, "address", "socketcan:can0")
     failure = ErrorParts.of(error)
     assert all((failure.error, failure.found, failure.expected, failure.do))
-    assert all(
-        label in dict(line[:2] for line in failure.lines()) for label in ("error", "expected", "do")
-    )
+    for label in ("error", "expected", "do"):
+        lines = dict(line[:2] for line in failure.lines())
+        assert label in lines
 
 
 @pytest.mark.parametrize(
@@ -86,7 +86,8 @@ def test_advice_names_verbs_that_exist(capsys: pytest.CaptureFixture[str]) -> No
         *(one for within in ADVICE_WITHIN.values() for one in within.values()),
     ]
     for expected, remedy in advice:
-        for verb, rest in re.findall(r"`drivegain ([a-z-]+)([^`]*)`", f"{expected} {remedy}"):
+        matches = re.findall(r"`drivegain ([a-z-]+)([^`]*)`", f"{expected} {remedy}")
+        for verb, rest in matches:
             assert main([verb, "--help"]) == 0
             text = capsys.readouterr().out
             assert all(option in text for option in re.findall(r"--[a-z-]+", rest))
@@ -123,7 +124,9 @@ def test_a_refused_connection_names_the_command_that_starts_a_cell(
         port = free.getsockname()[1]
     assert main(["init", str(tmp_path / "lathe"), "--simulated"]) == 0
     cell = tmp_path / "lathe/cells/lathe.yaml"
-    cell.write_text(cell.read_text(encoding="utf-8").replace("29536", str(port)), encoding="utf-8")
+    text = cell.read_text(encoding="utf-8")
+    changed_text = text.replace("29536", str(port))
+    cell.write_text(changed_text, encoding="utf-8")
     capsys.readouterr()
     assert main(["scan", str(cell)]) == ExitCode.DEVICE_FAULT
     said = capsys.readouterr().err
@@ -139,19 +142,21 @@ def test_a_refused_connection_names_the_command_that_starts_a_cell(
 def test_a_program_gets_one_object_a_line(capsys: pytest.CaptureFixture[str]) -> None:
     error = DataError("a\nb\udcff", found="x", expected="y", remedy="z")
     error.add_note("kept: c.mcap")
-    show_failure(ErrorParts.of(error), json_wanted=True)
+    failure = ErrorParts.of(error)
+    show_failure(failure, json_wanted=True)
     (line,) = capsys.readouterr().err.splitlines()
-    assert json.loads(line) == {
+    expected = {
         **{"error": "a\nb\udcff", "found": "x", "expected": "y", "do": "z"},
         **{"exit_code": 4, "kind": "DataError", "kept": "c.mcap"},
     }
+    assert json.loads(line) == expected
     stop = DriveFault(3, "fault")
     stop.add_note("while stopping: J3 (node 3) does not answer")
-    assert "axes" not in json_tree(ErrorParts.of(stop).document())
+    report = ErrorParts.of(stop).document()
+    assert "axes" not in json_tree(report)
     stop.add_note("not confirmed without power: J3 (node 3)")
-    assert ErrorParts.of(stop).document().axes == (
-        "J3 (node 3) NOT CONFIRMED WITHOUT POWER: use the emergency stop"
-    )
+    document = ErrorParts.of(stop).document()
+    assert document.axes == ("J3 (node 3) NOT CONFIRMED WITHOUT POWER: use the emergency stop")
 
 
 def test_what_a_stop_could_not_confirm_is_shown_though_a_later_error_hides_its_cause() -> None:
@@ -211,7 +216,8 @@ def test_an_interrupt_says_what_was_kept_and_leaves_no_empty_folder(
     request.addfinalizer(lambda: signal.signal(signal.SIGINT, before))
     monkeypatch.setattr("daq.workflow.fit.fit", lambda *_, **__: signal.raise_signal(signal.SIGINT))
     (tmp_path / "kept").mkdir()
-    for folder, stays in ((tmp_path / "new" / "report", False), (tmp_path / "kept", True)):
+    report_folder = tmp_path / "new" / "report"
+    for folder, stays in ((report_folder, False), (tmp_path / "kept", True)):
         assert main(["residual", "x.mcap", "--report", str(folder)]) == ExitCode.INTERRUPTED
         assert capsys.readouterr().err.endswith("interrupted: no file was written\n")
         assert folder.exists() is stays

@@ -42,7 +42,8 @@ from tests.daq.logs import DISC, content, demo_content, joints, samples, write
     ],
 )
 def test_hostile_metadata_is_a_value_error(key: str, value: str) -> None:
-    record = run_record(content(6, DISC).run)
+    info = content(6, DISC).run
+    record = run_record(info)
     assert run_from_record(record).payload == DISC
     with pytest.raises(ValueError, match=r".+"):
         run_from_record({**record, key: value})
@@ -75,7 +76,8 @@ def test_hostile_counts_are_a_value_error(key: str, value: str) -> None:
 )
 def test_a_hostile_quantum_is_a_value_error(number: str) -> None:
     text = '{"axes": [{"name": "J1", "current_per_unit": %s}]}'
-    assert readback_from_bytes((text % "0.002").encode()).axes[0].current_per_unit == 0.002
+    readback = readback_from_bytes((text % "0.002").encode())
+    assert readback.axes[0].current_per_unit == 0.002
     with pytest.raises(
         ValueError,
         match=r"current_per_unit is .+, expected "
@@ -104,7 +106,8 @@ def test_info_refuses_the_counts_that_a_fit_refuses(
     monkeypatch.setattr(
         "daq.log.writer.statistics_record", lambda given: {**genuine(given), **statistics}
     )
-    log = write(tmp_path / "a.mcap", demo_content(checkout), samples([[k] * 6 for k in range(300)]))
+    path = tmp_path / "a.mcap"
+    log = write(path, demo_content(checkout), samples([[k] * 6 for k in range(300)]))
     assert main(["info", str(log), "--json"]) == ExitCode.DATA_UNFIT
     output = capsys.readouterr()
     assert output.out == ""
@@ -116,8 +119,9 @@ def test_very_many_unknown_keys_are_counted_and_not_all_explained() -> None:
         name: str
 
     keys = "\n".join(f"key{number}: 1" for number in range(20_000))
+    text = f"name: x\n{keys}".encode()
     with pytest.raises(SchemaMismatch, match=f"{20_000 - MAX_EXPLAINED} more faults"):
-        read_model(parse_yaml(f"name: x\n{keys}".encode(), "file.yaml"), Small)
+        read_model(parse_yaml(text, "file.yaml"), Small)
 
 
 def test_a_disk_that_is_full_from_the_start_leaves_nothing(
@@ -153,7 +157,8 @@ def test_a_disk_that_is_full_from_the_start_leaves_nothing(
 def test_a_stop_that_was_not_confirmed_is_shouted(capsys: pytest.CaptureFixture[str]) -> None:
     error = DriveFault(3, "fault")
     error.add_note("while stopping: node 3: object 6041h:00: no answer")
-    show_failure(ErrorParts.of(error), json_wanted=False)
+    failure = ErrorParts.of(error)
+    show_failure(failure, json_wanted=False)
     # It was stopped, and confirmed by other means
     assert "emergency stop" not in capsys.readouterr().err
     error.add_note("not confirmed without power: node 3")
@@ -165,7 +170,8 @@ def test_a_stop_that_was_not_confirmed_is_shouted(capsys: pytest.CaptureFixture[
 
 
 def test_a_stop_that_was_confirmed_is_not(capsys: pytest.CaptureFixture[str]) -> None:
-    show_failure(ErrorParts.of(DriveFault(3, "fault")), json_wanted=False)
+    failure = ErrorParts.of(DriveFault(3, "fault"))
+    show_failure(failure, json_wanted=False)
     assert "emergency" not in capsys.readouterr().err
 
 
@@ -202,7 +208,8 @@ def test_one_name_for_two_outputs_is_refused_before_any_log_is_read(
 ) -> None:
     same = str(tmp_path / "same")
     assert main([verb, str(tmp_path / "no.mcap"), "--out", same, other, same]) == ExitCode.USAGE
-    assert f"the same name for --out and {other}" in capsys.readouterr().err
+    error_output = capsys.readouterr().err
+    assert f"the same name for --out and {other}" in error_output
     assert not list(tmp_path.iterdir())
 
 

@@ -50,8 +50,10 @@ NONSENSE: dict[str, dict[str, Any]] = {
 def cell(tmp_path: Path) -> Path:
     """The demo cell in a folder of its own."""
     kept = shutil.ignore_patterns("*.jsonl*", "*.sqlite*")
-    shutil.copytree(Path(__file__).parents[3] / "configs", tmp_path / "configs", ignore=kept)
-    return tmp_path / "configs" / "cells" / "demo.yaml"
+    configs_folder = Path(__file__).parents[3] / "configs"
+    shutil.copytree(configs_folder, tmp_path / "configs", ignore=kept)
+    cells_folder = tmp_path / "configs" / "cells"
+    return cells_folder / "demo.yaml"
 
 
 def _key(changes: dict[str, Any]) -> str:

@@ -39,8 +39,10 @@ REFUSED = {ExitCode.CALIBRATION_REFUSED, ExitCode.DATA_UNFIT, ExitCode.CONFIGURA
 def cell(tmp_path: Path) -> Path:
     """The demo cell with a job, in a folder of its own."""
     kept = shutil.ignore_patterns("*.jsonl*", "*.sqlite*")
-    shutil.copytree(Path(__file__).parents[3] / "configs", tmp_path / "configs", ignore=kept)
-    path = tmp_path / "configs" / "cells" / "demo.yaml"
+    configs_folder = Path(__file__).parents[3] / "configs"
+    shutil.copytree(configs_folder, tmp_path / "configs", ignore=kept)
+    cells_folder = tmp_path / "configs" / "cells"
+    path = cells_folder / "demo.yaml"
     path.write_text(path.read_text() + JOB)
     return path
 
@@ -59,7 +61,8 @@ def test_links_in_a_circle_are_refused_by_every_verb(
     cell: Path, name: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     calibration = calibration_for(cell)
-    make_circle(Path(os.path.normpath(cell.parent / name)))
+    path = Path(os.path.normpath(cell.parent / name))
+    make_circle(path)
     file = str(cell)
     fitted = str(calibration)
     verbs = [["apply", file, fitted, "--yes"], ["rollback", file], ["history", file, "--verify"]]
@@ -69,9 +72,10 @@ def test_links_in_a_circle_are_refused_by_every_verb(
         ["validate", fitted, "no.mcap"],
     ]
     if name in CONFIGURED:
+        out_folder = cell.parent / "out"
         verbs += [
             ["history", file, "--rebuild"],
-            ["certificate", fitted, "--cell", file, "--out", str(cell.parent / "out")],
+            ["certificate", fitted, "--cell", file, "--out", str(out_folder)],
         ]
     for verb in verbs[:-1] if name == "demo.yaml" else verbs:
         code = main(verb)
@@ -149,7 +153,8 @@ def _outputs() -> Iterator[tuple[str, list[str]]]:
                 words = [verb.name]
             params = kind.command().params
             for one in params:
-                if "Path" in str(one.type_descriptor.annotation) and one.name in WRITTEN:
+                annotation_text = str(one.type_descriptor.annotation)
+                if "Path" in annotation_text and one.name in WRITTEN:
                     yield f"{' '.join(words)} {one.name}", [*words, *arguments(kind, params, one)]
 
 
@@ -197,22 +202,22 @@ def test_no_verb_writes_to_a_place_that_another_user_chose_nor_to_a_device(
     calibration = tmp_path / "calibration.yaml"
     save_calibration(demo_calibration(), calibration)
     before = place.lstat()
+    demo_path = shipped / "cells" / "demo.yaml"
     files = {
         "PIPE": place,
-        "configs/cells/demo.yaml": shipped / "cells" / "demo.yaml",
+        "configs/cells/demo.yaml": demo_path,
         "calibration.yaml": calibration,
     }
     assert main([str(files.get(word, word)) for word in OUTPUTS[line]]) not in (
         ExitCode.OK,
         ExitCode.UNEXPECTED,
     )
-    assert found in " ".join(capsys.readouterr().err.split())
+    error_output = capsys.readouterr().err
+    assert found in " ".join(error_output.split())
     after = place.lstat()
-    assert (after.st_ino, after.st_mode, elsewhere.stat().st_size) == (
-        before.st_ino,
-        before.st_mode,
-        0,
-    )
+    st_size = elsewhere.stat().st_size
+    expected = (before.st_ino, before.st_mode, 0)
+    assert (after.st_ino, after.st_mode, st_size) == expected
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root may give a link away")
@@ -272,6 +277,7 @@ def test_a_log_does_not_begin_under_the_name_of_a_link_that_leads_nowhere(
 ) -> None:
     """Its last step, the rename, would find the name taken."""
     (tmp_path / "a.mcap").symlink_to(tmp_path / "gone.mcap")
+    path = tmp_path / "a.mcap"
     with pytest.raises(UsageError, match="found a file of that name; expected none"):
-        write(tmp_path / "a.mcap", demo_content(checkout), samples([[0] * 6] * 5))
+        write(path, demo_content(checkout), samples([[0] * 6] * 5))
     assert not (tmp_path / "a.mcap.part").exists()

@@ -22,7 +22,8 @@ def test_signals_that_were_ignored_from_birth_are_heard_and_others_left_alone() 
     deaf = signal.signal(signal.SIGINT, signal.SIG_IGN)
     hangup = signal.getsignal(signal.SIGHUP)
     try:
-        with interruptible(signals=(signal.SIGINT, signal.SIGTERM)):
+        signals = (signal.SIGINT, signal.SIGTERM)
+        with interruptible(signals=signals):
             assert signal.getsignal(signal.SIGHUP) == hangup
             with pytest.raises(KeyboardInterrupt):
                 signal.raise_signal(signal.SIGINT)
@@ -137,11 +138,8 @@ sys.exit(main(["explain-emcy", "--help"]))
     done = subprocess.run(
         [sys.executable, "-c", script], capture_output=True, text=True, check=False
     )
-    assert (done.returncode, done.stdout, done.stderr) == (
-        ExitCode.INTERRUPTED,
-        "",
-        "interrupted\n",
-    )
+    expected = (ExitCode.INTERRUPTED, "", "interrupted\n")
+    assert (done.returncode, done.stdout, done.stderr) == expected
 
 
 def test_an_interrupted_plan_says_how_to_get_what_it_had(

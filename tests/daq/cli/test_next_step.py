@@ -76,7 +76,8 @@ def made(checkout: Path, tmp_path_factory: pytest.TempPathFactory) -> Plan:
 
 def written(name: str, plan: Plan, std_percent: float, seed: int) -> Plan:
     """A plan file with other predictions; the plan that it holds."""
-    changed = replace(plan, predicted_std_percent=(std_percent,) * 6, seed=seed)
+    predicted_std_percent = (std_percent,) * 6
+    changed = replace(plan, predicted_std_percent=predicted_std_percent, seed=seed)
     save_plan(changed, Path(name))
     return changed
 
@@ -89,11 +90,14 @@ def words(said: str) -> list[str]:
 
 
 def test_runs_of_a_folder_are_the_valid_ones_of_this_cell(cell: Cell, make_log: LogMaker) -> None:
-    loaded = [make_log("b.mcap", loaded=True), make_log("a.mcap", loaded=True)]
+    log = make_log("b.mcap", loaded=True)
+    loaded = [log, make_log("a.mcap", loaded=True)]
     bare = make_log("bare.mcap")
     make_log("lossy.mcap", verdict=(False, "3 cycles lost"))
     Path("other.mcap").write_bytes(b"no log")
-    assert runs_in(Path(), "demo") == FolderRuns((bare,), tuple(loaded))
+    runs = runs_in(Path(), "demo")
+    expected = FolderRuns((bare,), tuple(loaded))
+    assert runs == expected
     assert runs_in(Path(), "saw") == FolderRuns()
 
 
@@ -110,9 +114,8 @@ def test_logs_that_take_long_to_read_are_not_read_for_a_hint(
     assert runs_in(Path(), "demo") is None
     say_after_record(CELL, cell, Path("plan.yaml"), bare, loaded=False)
     assert "--payload" in words(capsys.readouterr().err)  # the run with the payload is never wrong
-    say_after_record(
-        CELL, cell, Path("plan.yaml"), make_log("loaded.mcap", loaded=True), loaded=True
-    )
+    log = make_log("loaded.mcap", loaded=True)
+    say_after_record(CELL, cell, Path("plan.yaml"), log, loaded=True)
     assert capsys.readouterr().err == ""  # of the others nothing is known
 
 
@@ -129,7 +132,8 @@ def test_each_plan_is_followed_by_the_run_that_is_missing(
     first = written("plan.yaml", made, 0.6, seed=1)
     say_after_plan(CELL, cell, Path("plan.yaml"), first)
     bare = ["record", str(CELL), "plan.yaml", "--out", "unloaded.mcap", "--enable-motion"]
-    assert words(capsys.readouterr().err)[1:] == bare
+    error_output = capsys.readouterr().err
+    assert words(error_output)[1:] == bare
     second = written("plan-2.yaml", made, 0.6, seed=2)
     say_after_plan(CELL, cell, Path("plan-2.yaml"), second)
     assert words(capsys.readouterr().err)[1:] == bare
@@ -141,9 +145,8 @@ def test_each_plan_is_followed_by_the_run_that_is_missing(
     say_after_plan(CELL, cell, Path("plan-2.yaml"), second)
     assert words(capsys.readouterr().err)[1:] == loaded
 
-    say_after_record(
-        CELL, cell, Path("plan.yaml"), make_log("loaded.mcap", loaded=True), loaded=True
-    )
+    log = make_log("loaded.mcap", loaded=True)
+    say_after_record(CELL, cell, Path("plan.yaml"), log, loaded=True)
     assert words(capsys.readouterr().err)[1:] == [
         "fit",
         "bare.mcap",
@@ -160,7 +163,8 @@ def test_each_plan_is_followed_by_the_run_that_is_missing(
         CELL, cell, Path("plan-2.yaml"), make_log("held-out.mcap", loaded=True), loaded=True
     )
     search = words(capsys.readouterr().err)
-    assert search[1:5] == ["residual", "bare.mcap", "loaded.mcap", "--holdout"]
+    expected = ["residual", "bare.mcap", "loaded.mcap", "--holdout"]
+    assert search[1:5] == expected
     assert search[5:] == ["held-out.mcap", "--out", "calibration-2.yaml", "--report", "report"]
     say_after_record(
         CELL, cell, Path("plan-2.yaml"), make_log("more.mcap", loaded=True), loaded=True
@@ -185,9 +189,8 @@ def test_a_run_with_load_that_was_first_is_followed_by_one_without(
     cell: Cell, made: Plan, make_log: LogMaker, capsys: pytest.CaptureFixture[str]
 ) -> None:
     written("plan.yaml", made, 0.6, seed=1)
-    say_after_record(
-        CELL, cell, Path("plan.yaml"), make_log("first.mcap", loaded=True), loaded=True
-    )
+    log = make_log("first.mcap", loaded=True)
+    say_after_record(CELL, cell, Path("plan.yaml"), log, loaded=True)
     assert "--payload" not in words(capsys.readouterr().err)
 
 
@@ -212,7 +215,8 @@ def test_a_calibration_is_followed_by_its_dry_run(
     log = make_log("bare.mcap")
     file = calibration_for(CELL)
     say_after_calibration(load_calibration(file), file, [log], None)
-    assert words(capsys.readouterr().err) == ["drivegain", "apply", str(CELL), str(file)]
+    error_output = capsys.readouterr().err
+    assert words(error_output) == ["drivegain", "apply", str(CELL), str(file)]
     fixed = replace(
         demo_calibration(), gains=tuple(replace(gain, std=0.0) for gain in demo_calibration().gains)
     )
@@ -304,9 +308,8 @@ def test_a_calibration_that_the_cell_of_the_logs_refuses_is_not_applied_next(
     cell: Cell, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The certificate of the same search says that it must not be written."""
-    doubtful = load_calibration(
-        calibration_for(CELL, relative_error_percent=LARGE, holdout_error_percent=LARGE)
-    )
+    path = calibration_for(CELL, relative_error_percent=LARGE, holdout_error_percent=LARGE)
+    doubtful = load_calibration(path)
     shutil.rmtree("configs")
     assert say_after_calibration(doubtful, Path("calibration.yaml"), [], None, described=cell)
     assert "`drivegain apply` refuses this calibration" in capsys.readouterr().err
@@ -317,7 +320,9 @@ def test_a_search_that_wrote_nothing_names_itself_only_where_nothing_is_to_be_co
     cell: Cell, capsys: pytest.CaptureFixture[str], diagnoses: tuple[Diagnosis, ...]
 ) -> None:
     calibration = replace(load_calibration(calibration_for(CELL)), diagnoses=diagnoses)
-    _say_after_search(ResidualRequest(logs=[Path("bare.mcap")], cell=CELL), calibration, cell)
+    logs = [Path("bare.mcap")]
+    request = ResidualRequest(logs=logs, cell=CELL)
+    _say_after_search(request, calibration, cell)
     said = capsys.readouterr().err
     assert ("Next: correct the description" in said) == bool(diagnoses)
     assert ("Next: drivegain residual bare.mcap" in said) == (not diagnoses)
@@ -363,4 +368,5 @@ def test_a_replaced_file_is_named_and_an_unrelated_one_is_not(
     said = capsys.readouterr().err
     assert "Replaced: plan.yaml (of" in said
     assert "Replaced: plan.html (of" in said
-    assert plan_module.plan_head(Path("plan.yaml")).seed == 1
+    head = plan_module.plan_head(Path("plan.yaml"))
+    assert head.seed == 1

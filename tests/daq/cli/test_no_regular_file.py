@@ -50,10 +50,8 @@ def _command_lines() -> Iterator[tuple[str, list[str]]]:
                 words = [verb.name]
             params = kind.command().params
             for one in params:
-                if (
-                    "Path" in str(one.type_descriptor.annotation)
-                    and one.name not in WRITTEN | OTHERS
-                ):
+                annotation_text = str(one.type_descriptor.annotation)
+                if "Path" in annotation_text and one.name not in WRITTEN | OTHERS:
                     yield f"{' '.join(words)} {one.name}", [*words, *arguments(kind, params, one)]
 
 
@@ -98,7 +96,8 @@ def folder(checkout: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a cell, a log and a calibration."""
     made = tmp_path_factory.mktemp("here")
     shutil.copytree(checkout / "configs", made / "configs")
-    write(made / "a.mcap", demo_content(checkout), samples([[0] * 6] * 50))
+    path = made / "a.mcap"
+    write(path, demo_content(checkout), samples([[0] * 6] * 50))
     save_calibration(demo_calibration(), made / "calibration.yaml")
     os.mkfifo(made / "pipe")
     return made

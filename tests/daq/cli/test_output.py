@@ -80,7 +80,8 @@ def _writer(file: FakeFile) -> OutputWriter:
 
 
 def _remark(number: int) -> Piece:
-    return Piece(OutputKind.REMARK, b"%099d\n" % number)
+    content = b"%099d\n" % number
+    return Piece(OutputKind.REMARK, content)
 
 
 def test_pieces_get_out_in_order_and_whole(file: FakeFile) -> None:
@@ -90,7 +91,8 @@ def test_pieces_get_out_in_order_and_whole(file: FakeFile) -> None:
     for piece in pieces:
         writer.put(piece)
     writer.wait()
-    assert file.content == b"".join(piece.content for piece in pieces)
+    expected = b"".join(piece.content for piece in pieces)
+    assert file.content == expected
     writer.close()
 
 
@@ -101,7 +103,8 @@ def test_where_nobody_reads_printing_returns_and_the_end_comes_in_its_bound(file
     assert file.is_waited_for.wait(LONG_S)
     began_s = time.monotonic()
     writer.close(NOBODY_S)
-    assert NOBODY_S <= time.monotonic() - began_s < LONG_S
+    now_difference_s = time.monotonic() - began_s
+    assert NOBODY_S <= now_difference_s < LONG_S
     assert file.content == b""
 
 
@@ -117,9 +120,11 @@ def test_remarks_beyond_the_room_are_left_out_and_counted_in_their_place(file: F
     writer.put(_remark(-2))
     writer.wait()
     lines = file.content.decode().splitlines()
-    assert [int(line) for line in lines[:kept]] == list(range(kept))
+    expected = list(range(kept))
+    assert [int(line) for line in lines[:kept]] == expected
     assert lines[kept:-1] == ["(8 lines were left out here: nothing read the output)", "the result"]
-    assert int(lines[-1]) == -2
+    last_line = lines[-1]
+    assert int(last_line) == -2
     writer.close()
 
 
@@ -226,9 +231,11 @@ def test_journal_story_and_remarks_return_and_keep_their_order_with_results(
 
     reading, writing = full_pipe
     with printing_to(writing):
-        Journal(sys.stderr, Form.JSON, now).say(Level.INFO, "first")
+        journal = Journal(sys.stderr, Form.JSON, now)
+        journal.say(Level.INFO, "first")
         say("second")
-        Story(sys.stderr, Form.TEXT, now).say(Level.WARNING, "third")
+        story = Story(sys.stderr, Form.TEXT, now)
+        story.say(Level.WARNING, "third")
         with show_steps() as stepper:
             stepper.step("fourth")
         with status("not for a pipe") as report_step:
@@ -239,14 +246,10 @@ def test_journal_story_and_remarks_return_and_keep_their_order_with_results(
             logging.makeLogRecord({"msg": "sixth", "levelno": logging.WARNING})
         )
         shown = _read_on(reading, b"sixth\n").decode().splitlines()
-    assert json.loads(shown[0])["event"] == "first"
-    assert [line.strip() for line in shown[1:]] == [
-        "second",
-        "! third:",
-        "fourth (0 s)",
-        "fifth",
-        "sixth",
-    ]
+    document = json.loads(shown[0])
+    assert document["event"] == "first"
+    expected = ["second", "! third:", "fourth (0 s)", "fifth", "sixth"]
+    assert [line.strip() for line in shown[1:]] == expected
 
 
 def test_a_journal_for_programs_says_what_it_lacks_as_an_event(full_pipe: tuple[int, int]) -> None:
@@ -255,11 +258,13 @@ def test_a_journal_for_programs_says_what_it_lacks_as_an_event(full_pipe: tuple[
         journal = Journal(sys.stderr, Form.JSON, lambda: datetime(2026, 1, 1, tzinfo=UTC))
         say_losses_as(lambda lines: journal.line(Level.WARNING, "lines left out", lines=lines))
         for number in range(3):
-            journal.say(Level.INFO, "event", number=number, text="x" * (REMARKS_BYTES // 3))
+            text = "x" * (REMARKS_BYTES // 3)
+            journal.say(Level.INFO, "event", number=number, text=text)
         shown = _read_on(reading, b'"lines": 1}\n')
     events = [json.loads(line) for line in shown.splitlines()]
     assert [event.get("number") for event in events] == [0, 1, None]
-    assert events[-1]["event"] == "lines left out"
+    last_event = events[-1]
+    assert last_event["event"] == "lines left out"
 
 
 def test_a_bar_is_not_drawn_while_the_terminal_is_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -409,9 +414,8 @@ daq.cli.app._run = fail
 sys.exit(daq.cli.app.main())
 """
     command = [sys.executable, "-c", script, "explain-emcy"]
-    done = subprocess.run(
-        command, stderr=full_pipe[1], cwd=checkout, timeout=PATIENCE_S + LONG_S, check=False
-    )
+    timeout = PATIENCE_S + LONG_S
+    done = subprocess.run(command, stderr=full_pipe[1], cwd=checkout, timeout=timeout, check=False)
     assert done.returncode == ExitCode.UNEXPECTED
     read = subprocess.run(command, capture_output=True, text=True, cwd=checkout, check=False)
     assert read.returncode == ExitCode.UNEXPECTED

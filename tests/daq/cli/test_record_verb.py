@@ -30,9 +30,8 @@ def cells(tmp_path: Path, checkout: Path, monkeypatch: pytest.MonkeyPatch) -> di
         .replace("../robots", str(checkout / "configs/robots"))
     )
     for pacing in ("lockstep", "timed"):
-        (folder / f"{pacing}.yaml").write_text(
-            text.replace("pacing: lockstep", f"pacing: {pacing}")
-        )
+        changed_text = text.replace("pacing: lockstep", f"pacing: {pacing}")
+        (folder / f"{pacing}.yaml").write_text(changed_text)
     return {pacing: str(folder / f"{pacing}.yaml") for pacing in ("lockstep", "timed")}
 
 
@@ -61,9 +60,8 @@ def test_a_recording_with_losses_is_reported_and_is_no_success(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    counted = RunStatistics(
-        1000, 0, (0, 2, 0, 0, 0, 0), valid, "" if valid else "2 missing answers"
-    )
+    missing = (0, 2, 0, 0, 0, 0)
+    counted = RunStatistics(1000, 0, missing, valid, "" if valid else "2 missing answers")
     monkeypatch.setattr(
         "daq.workflow.record.record",
         lambda *_, **__: Recorded(tmp_path / "a.mcap", counted, StreamStatistics()),
@@ -79,7 +77,8 @@ def test_a_recording_with_losses_is_reported_and_is_no_success(
     assert main(command) == code
     assert said in capsys.readouterr().out
     assert main([*command, "--json"]) == code
-    assert json.loads(capsys.readouterr().out)["valid"] is valid
+    document = json.loads(capsys.readouterr().out)
+    assert document["valid"] is valid
 
 
 @pytest.mark.parametrize("name", ["run.mcap", "my run.mcap"])
@@ -93,11 +92,11 @@ def test_a_failed_recording_says_what_it_left_and_the_next_one_what_is_in_its_wa
     out = tmp_path / name
     part = tmp_path / f"{name}.part"
     command = ["record", cells["lockstep"], "plan.yaml", "--out", str(out), "--enable-motion"]
-    monkeypatch.setattr(
-        "daq.workflow.record.record", _failing(DriveFault(3, "no heartbeat for 0.5 s"), part)
-    )
+    error = DriveFault(3, "no heartbeat for 0.5 s")
+    monkeypatch.setattr("daq.workflow.record.record", _failing(error, part))
     assert main(command) == ExitCode.DEVICE_FAULT
-    first = " ".join(capsys.readouterr().err.split())
+    error_output = capsys.readouterr().err
+    first = " ".join(error_output.split())
     assert f"kept: the samples recorded until then are in {part}" in first
     # The second attempt does not even reach the bus.
     monkeypatch.setattr(
@@ -120,16 +119,16 @@ def test_a_lost_sample_of_a_real_cell_does_not_name_lockstep(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     real = Path(cells["timed"]).with_name("real.yaml")
-    real.write_text(
-        Path(cells["timed"]).read_text().replace("interface: virtual", "interface: socketcan")
-    )
+    text = Path(cells["timed"]).read_text()
+    real.write_text(text.replace("interface: virtual", "interface: socketcan"))
     error = SampleLost(7, (0,), ("J1 (node 1)",))
     monkeypatch.setattr("daq.workflow.record.record", _failing(error, None))
     assert (
         main(["record", str(real), "plan.yaml", "--out", str(tmp_path / "run.mcap")])
         == ExitCode.DEVICE_FAULT
     )
-    output = " ".join(capsys.readouterr().err.split())
+    error_output = capsys.readouterr().err
+    output = " ".join(error_output.split())
     assert "hint: check the load of bus and computer" in output
     assert "lockstep" not in output
 
@@ -154,7 +153,8 @@ def test_a_lost_sample_with_a_timed_pacing_names_lockstep(
     monkeypatch.setattr("daq.workflow.record.record", _failing(error, None))
     command = ["record", cells[pacing], "plan.yaml", "--out", str(tmp_path / "run.mcap")]
     assert main(command) == ExitCode.DEVICE_FAULT
-    output = " ".join(capsys.readouterr().err.split())
+    error_output = capsys.readouterr().err
+    output = " ".join(error_output.split())
     assert ("hint:" in output) is hinted
     assert ("`sync.pacing: lockstep`" in output) is hinted
     assert "kept:" not in output

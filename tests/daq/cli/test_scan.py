@@ -55,9 +55,8 @@ def _node(node_id: int, statusword: int | None, serial: int | None = None) -> Fo
 
 def _shown(cell: Cell, nodes: tuple[FoundNode, ...], width: int) -> str:
     out = io.StringIO()
-    Console(file=out, width=width, soft_wrap=True).print(
-        scan_table(scanned_nodes(cell, nodes, "demo"))
-    )
+    console = Console(file=out, width=width, soft_wrap=True)
+    console.print(scan_table(scanned_nodes(cell, nodes, "demo")))
     return out.getvalue()
 
 
@@ -79,10 +78,13 @@ def test_an_enabled_axis_is_shouted(
 ) -> None:
     nodes = (_node(1, 0x250), _node(2, statusword))
     rows = scanned_nodes(cell, nodes, "demo")
-    assert [row.enabled for row in rows] == [False, enabled, None, None, None, None]
+    expected = [False, enabled, None, None, None, None]
+    assert [row.enabled for row in rows] == expected
     in_fault = statusword in {0x0208, 0x020F}
-    assert [row.in_fault for row in rows] == [False, in_fault, *[False] * 4]
-    assert [row.verdict for row in rows] == [
+    in_faults = [row.in_fault for row in rows]
+    assert in_faults == [False, in_fault, *[False] * 4]
+    verdicts = [row.verdict for row in rows]
+    assert verdicts == [
         "ok",
         "in fault" if in_fault else "ok",
         *["missing"] * 4,
@@ -120,7 +122,8 @@ def test_a_scan_without_answers_does_not_advise_a_scan(
 ) -> None:
     configs = Path(shutil.copytree(checkout / "configs", tmp_path / "configs"))
     file = configs / "cells/demo.yaml"
-    file.write_text(file.read_text().replace("node_id: 6", "node_id: 66"))
+    changed_text = file.read_text().replace("node_id: 6", "node_id: 66")
+    file.write_text(changed_text)
     with (
         open_bus(bus_address(cell)) as bus,
         SimulatedCell(load_simulation(shipped_simulation("clean")), bus),
@@ -133,7 +136,9 @@ def test_a_scan_without_answers_does_not_advise_a_scan(
 
 
 def test_a_real_bus_without_a_node_names_the_wiring(cell: Cell) -> None:
-    real = replace(cell, buses=(replace(cell.buses[0], interface="socketcan"),))
+    changed_buses = replace(cell.buses[0], interface="socketcan")
+    buses = (changed_buses,)
+    real = replace(cell, buses=buses)
     axes = drive_axes(real)
     assert "check power, wiring" in str(no_answer(real, axes, (), 0.5))
     # One answered: a cell is there
@@ -142,7 +147,8 @@ def test_a_real_bus_without_a_node_names_the_wiring(cell: Cell) -> None:
 
 def test_a_message_names_the_axis_first(cell: Cell) -> None:
     rows = scanned_nodes(cell, (_node(3, 0x237), _node(9, 0x237)), "demo")
-    said = [str(part) for part in scan_view(scan_report(cell, rows, {}, (), ()))]
+    report = scan_report(cell, rows, {}, (), ())
+    said = [str(part) for part in scan_view(report)]
     assert said[1].startswith("J3 (node 3) IS ENABLED")
     assert said[2].startswith("node 9 IS ENABLED")
 
@@ -157,19 +163,22 @@ def test_identity_and_power_are_distinguished(cell: Cell) -> None:
 
 
 def test_table_and_remarks_write_the_numbers_of_an_identity_alike(cell: Cell) -> None:
-    other = FoundNode(1, Identity(0x2, 0x3, 4), 1, "drive", 0x7F, 0x250)
+    identity = Identity(0x2, 0x3, 4)
+    other = FoundNode(1, identity, 1, "drive", 0x7F, 0x250)
     rows = scanned_nodes(cell, (other,), "demo")
     cells = _shown(cell, (other,), 200).split()
     for number, expected in (("0x2", "0x29a"), ("0x3", "0x40200"), ("4", "1001")):
         assert number in cells
+        remarks = rows[0].remarks
         assert any(
             f"is {number}, the cell configuration expects {expected}" in remark
-            for remark in rows[0].remarks
+            for remark in remarks
         )
 
 
 def test_a_drive_without_the_declared_serial_number_is_not_said_to_have_zero(cell: Cell) -> None:
-    silent = FoundNode(1, Identity(0x29A, None, None), 1, "drive", 0x7F, 0x250)
+    identity = Identity(0x29A, None, None)
+    silent = FoundNode(1, identity, 1, "drive", 0x7F, 0x250)
     (row, *_) = scanned_nodes(cell, (silent,), "demo")
     assert row.verdict == "other product code"
     assert row.remarks[:2] == [
@@ -185,9 +194,11 @@ def test_a_drive_without_the_declared_serial_number_is_not_said_to_have_zero(cel
 def test_a_field_that_is_left_out_of_an_identity_is_not_compared(
     cell: Cell, identity: Identity | None, reported: Identity
 ) -> None:
-    axes = (replace(cell.axes[0], identity=identity), *cell.axes[1:])
+    changed_axis = replace(cell.axes[0], identity=identity)
+    axes = (changed_axis, *cell.axes[1:])
     node = FoundNode(1, reported, 1, "drive", 0x7F, 0x250)
-    (row, *_) = scanned_nodes(replace(cell, axes=axes), (node,), "demo")
+    changed_cell = replace(cell, axes=axes)
+    (row, *_) = scanned_nodes(changed_cell, (node,), "demo")
     product_missing = identity == Identity(0x29A, 0x40200) and reported.product_code is None
     assert row.verdict == ("other product code" if product_missing else "ok")
 
@@ -197,7 +208,8 @@ def test_a_cell_without_serial_does_not_compare_it(cell: Cell) -> None:
         replace(axis, identity=axis.identity and replace(axis.identity, serial=None))
         for axis in cell.axes
     )
-    (row, *_) = scanned_nodes(replace(cell, axes=axes), (_node(1, 0x250, serial=9),), "demo")
+    changed_cell = replace(cell, axes=axes)
+    (row, *_) = scanned_nodes(changed_cell, (_node(1, 0x250, serial=9),), "demo")
     assert (row.verdict, row.remarks) == ("ok", [])
 
 
@@ -206,8 +218,10 @@ def test_two_devices_and_a_profile_that_does_not_fit_are_said(cell: Cell) -> Non
     rows = scanned_nodes(
         cell, (shared, _node(2, 0x250)), "demo", {"J2": "found no object 6074h:00"}
     )
-    assert [row.verdict for row in rows[:2]] == ["two devices", "profile does not fit"]
-    said = [str(part) for part in scan_view(scan_report(cell, rows, {}, (), ()))]
+    verdicts = [row.verdict for row in rows[:2]]
+    assert verdicts == ["two devices", "profile does not fit"]
+    report = scan_report(cell, rows, {}, (), ())
+    said = [str(part) for part in scan_view(report)]
     assert said[1].startswith(
         "J1 (node 1): found two answers to one request; two devices have this node id"
     )
@@ -231,15 +245,11 @@ def test_a_drive_without_an_object_of_its_profile_is_found_on_the_bus(
 
         monkeypatch.setattr(server, "_read", read)
         assert main(["scan", str(checkout / "configs/cells/demo.yaml"), "--json"]) == ExitCode.OK
-    rows = json.loads(capsys.readouterr().out)["nodes"]
-    assert [row["verdict"] for row in rows] == [
-        "ok",
-        "ok",
-        "profile does not fit",
-        "ok",
-        "ok",
-        "ok",
-    ]
+    printed = capsys.readouterr().out
+    rows = json.loads(printed)["nodes"]
+    expected = ["ok", "ok", "profile does not fit", "ok", "ok", "ok"]
+    verdicts = [row["verdict"] for row in rows]
+    assert verdicts == expected
     (remark,) = rows[2]["remarks"]
     assert "no object 6075h:00 (scale of the current)" in remark
 
@@ -297,13 +307,17 @@ def test_a_fault_is_reset_when_a_person_says_so_and_nothing_gets_power(
         shown = capsys.readouterr().out
         assert "in fault" in shown
         assert "--reset-faults" in shown
-        assert simulated.nodes[2].drive.state is PowerState.FAULT
+        drive = simulated.nodes[2].drive
+        assert drive.state is PowerState.FAULT
         assert main(["scan", file, "--reset-faults", "--json"]) == ExitCode.OK
         document = json.loads(capsys.readouterr().out)
         assert document["reset"] == ["J3"]
         assert document["faults"]["J3"].startswith("8611h: ")
-        assert [node["verdict"] for node in document["nodes"]] == ["ok"] * 6
-        assert [node.drive.state for node in simulated.nodes] == [PowerState.SWITCH_ON_DISABLED] * 6
+        verdicts = [node["verdict"] for node in document["nodes"]]
+        assert verdicts == ["ok"] * 6
+        states = [node.drive.state for node in simulated.nodes]
+        expected = [PowerState.SWITCH_ON_DISABLED] * 6
+        assert states == expected
         # Asked of a cell without a fault it does nothing.
         assert main(["scan", file, "--reset-faults"]) == ExitCode.OK
         assert "was reset" not in capsys.readouterr().out
@@ -320,16 +334,22 @@ def test_a_mistyped_nameplate_is_reported_with_its_line(
     """
     configs = Path(shutil.copytree(checkout / "configs", tmp_path / "configs"))
     file = configs / "cells/demo.yaml"
-    file.write_text(file.read_text().replace("25.65", "25650"))
-    line = 1 + next(n for n, text in enumerate(file.read_text().splitlines()) if "25650" in text)
+    changed_text = file.read_text().replace("25.65", "25650")
+    file.write_text(changed_text)
+    lines = file.read_text().splitlines()
+    line = 1 + next(n for n, text in enumerate(lines) if "25650" in text)
     spec = load_simulation(shipped_simulation("clean"))
-    gains = np.array([np.sqrt(2.0) * cell.axes[0].nameplate_gain, 0.0, 25.65])
-    constants = gains / np.abs(DriveTrain(cell.ratio).reduction[:3])
+    nameplate_gain = cell.axes[0].nameplate_gain
+    gains = np.array([np.sqrt(2.0) * nameplate_gain, 0.0, 25.65])
+    reduction = DriveTrain(cell.ratio).reduction
+    absolute_reduction = np.abs(reduction[:3])
+    constants = gains / absolute_reduction
     first, third = (
         replace(spec.axes[i], entered_torque_nm=constants[i] * spec.axes[i].rated_current_a)
         for i in (0, 2)
     )
-    spec = replace(spec, axes=(first, spec.axes[1], third, *spec.axes[3:]))
+    axes = (first, spec.axes[1], third, *spec.axes[3:])
+    spec = replace(spec, axes=axes)
     with open_bus(bus_address(cell)) as bus, SimulatedCell(spec, bus):
         assert main(["scan", str(file)]) == ExitCode.OK
         shown = capsys.readouterr()
@@ -388,12 +408,16 @@ def test_a_profile_without_its_peak_current_costs_one_axis_its_check_and_no_driv
 
     document, shown = scan_edited(checkout, cell, tmp_path, edit, capsys)
     rows = document["nodes"]
-    assert [row["serial"] for row in rows] == [1001, 1002, 1003, 1004, 1005, 1006]
-    assert [row["verdict"] for row in rows] == ["profile incomplete", *["ok"] * 5]
+    expected = [1001, 1002, 1003, 1004, 1005, 1006]
+    serials = [row["serial"] for row in rows]
+    assert serials == expected
+    verdicts = [row["verdict"] for row in rows]
+    assert verdicts == ["profile incomplete", *["ok"] * 5]
     (remark,) = rows[0]["remarks"]
     assert "current_scale.peak_current_a: found nothing; expected the peak current" in remark
     assert document["cell_fault"] == ""
-    assert sorted(document["current"]) == ["J2", "J3", "J4", "J5", "J6"]
+    sorted_currents = sorted(document["current"])
+    assert sorted_currents == ["J2", "J3", "J4", "J5", "J6"]
     assert "J1 (node 1): " in shown
     assert "copy the profile to drives/" in shown
 
@@ -420,7 +444,8 @@ def test_a_wrong_number_elsewhere_keeps_no_drive_from_being_found(
     document, shown = scan_edited(
         checkout, cell, tmp_path, lambda text: text.replace(before, after, 1), capsys
     )
-    assert [row["verdict"] for row in document["nodes"]] == ["ok"] * 6
+    verdicts = [row["verdict"] for row in document["nodes"]]
+    assert verdicts == ["ok"] * 6
     assert said in document["cell_fault"]
     assert "every other command refuses the cell file" in shown
 
@@ -450,8 +475,11 @@ def test_what_is_wrong_with_one_axis_costs_that_axis_alone(
         return f"{head}{after}{tail}" if mark else text
 
     document, _ = scan_edited(checkout, cell, tmp_path, edit, capsys)
-    assert [row["verdict"] for row in document["nodes"]] == ["ok"] * 5 + [verdict]
-    said = document["cell_fault"] + str(document["nodes"][5]["remarks"])
+    expected = ["ok"] * 5 + [verdict]
+    verdicts = [row["verdict"] for row in document["nodes"]]
+    assert verdicts == expected
+    remarks = document["nodes"][5]["remarks"]
+    said = document["cell_fault"] + str(remarks)
     assert after.partition(": ")[2] in said
 
 
@@ -460,7 +488,8 @@ def test_a_file_without_any_node_id_is_refused_as_before(
 ) -> None:
     configs = Path(shutil.copytree(checkout / "configs", tmp_path / "configs"))
     file = configs / "cells/demo.yaml"
-    file.write_text(file.read_text().replace("node_id: ", "node: "))
+    changed_text = file.read_text().replace("node_id: ", "node: ")
+    file.write_text(changed_text)
     assert main(["scan", str(file), "--json"]) == ExitCode.CONFIGURATION
     failure = json.loads(capsys.readouterr().err)
     assert failure["kind"] == "SchemaMismatch"
@@ -514,7 +543,8 @@ def test_a_scan_beside_a_master_whose_lock_is_not_seen_sends_nothing(
 
         def lead() -> None:
             while not over.wait(0.01):
-                master.send(can.Message(arbitration_id=0x80, is_extended_id=False))
+                message = can.Message(arbitration_id=0x80, is_extended_id=False)
+                master.send(message)
 
         leading = threading.Thread(target=lead)
         leading.start()
@@ -588,7 +618,8 @@ def test_a_scan_in_the_middle_of_a_motion_leaves_it_alone_and_accuses_no_drive(
     # All moves were made; on a busy machine an answer of the simulated cell may be late, which is
     # counted.
     assert ended[0] in (ExitCode.OK, ExitCode.DATA_UNFIT)
-    kinds = [event.kind for event in read_log(log).events]
+    events = read_log(log).events
+    kinds = [event.kind for event in events]
     assert kinds.count(EventKind.MOVE_END) == 2
     assert EventKind.BUS_BUSY not in kinds
     capsys.readouterr()
@@ -598,23 +629,28 @@ def test_a_scan_in_the_middle_of_a_motion_leaves_it_alone_and_accuses_no_drive(
 def two(checkout: Path) -> Cell:
     """The demo cell on two buses."""
     files = bundle(checkout / "configs/cells/demo.yaml")
-    text = on_two_buses(files["cell.yaml"].decode(), "virtual", "a", "b")
+    decoded_cell_yaml = files["cell.yaml"].decode()
+    text = on_two_buses(decoded_cell_yaml, "virtual", "a", "b")
     return cell_from_bundle({**files, "cell.yaml": text.encode()})
 
 
 def test_a_node_is_reported_where_it_is_and_where_it_belongs(two: Cell) -> None:
     left = scanned_nodes(two, tuple(_node(number, 0x250) for number in (1, 2, 4, 9)), "left")
-    assert [(row.bus, row.node_id, row.axis, row.verdict) for row in left] == [
+    expected = [
         ("left", 1, "J1", "ok"),
         ("left", 2, "J2", "ok"),
         ("left", 3, "J3", "missing"),
         ("left", 4, "J4", "belongs on right"),
         ("left", 9, None, "not configured"),
     ]
+    assert [(row.bus, row.node_id, row.axis, row.verdict) for row in left] == expected
     right = scanned_nodes(two, tuple(_node(number, 0x250) for number in (4, 5, 6)), "right")
-    assert [row.verdict for row in right] == ["ok"] * 3
+    verdicts = [row.verdict for row in right]
+    assert verdicts == ["ok"] * 3
     out = io.StringIO()
-    Console(file=out, width=200, soft_wrap=True).print(scan_table(left + right))
+    console = Console(file=out, width=200, soft_wrap=True)
+    nodes = left + right
+    console.print(scan_table(nodes))
     heading, _, *lines = out.getvalue().splitlines()
     assert heading.split()[:2] == ["bus", "node"]
     assert [line.split()[0] for line in lines if line.strip()] == ["left"] * 5 + ["right"] * 3

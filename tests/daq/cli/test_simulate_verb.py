@@ -25,8 +25,10 @@ from tests.drivers.simulation.cells import clean_cell
 
 
 def test_each_bus_has_its_nodes() -> None:
-    there = nodes_on_buses(("can0=1,2,3", "can1=4,5"), (1, 2, 3, 4, 5))
-    assert there == {"can0": frozenset((1, 2, 3)), "can1": frozenset((4, 5))}
+    node_ids = (1, 2, 3, 4, 5)
+    there = nodes_on_buses(("can0=1,2,3", "can1=4,5"), node_ids)
+    expected = {"can0": frozenset((1, 2, 3)), "can1": frozenset((4, 5))}
+    assert there == expected
 
 
 @pytest.mark.parametrize(
@@ -44,8 +46,9 @@ def test_each_bus_has_its_nodes() -> None:
     ],
 )
 def test_what_is_said_wrongly_of_a_bus_is_refused(said: tuple[str, ...], message: str) -> None:
+    node_ids = (1, 2, 3, 4)
     with pytest.raises(UsageError) as caught:
-        nodes_on_buses(said, (1, 2, 3, 4))
+        nodes_on_buses(said, node_ids)
     assert message in (
         f"{caught.value.subject} {caught.value.found}; expected: {caught.value.expected}"
     )
@@ -72,7 +75,8 @@ def test_the_part_of_a_cell_file_can_be_pasted() -> None:
         "axes with node_id 1, 2: add bus: can0",
         "axes with node_id 3: add bus: can1",
     ]
-    one = BusPart("can0", BusAddress("socketcan", "can0"), frozenset())
+    address = BusAddress("socketcan", "can0")
+    one = BusPart("can0", address, frozenset())
     _, pasted, _ = how_to_reach((one,), 1000).split("\n\n")
     assert yaml.safe_load(pasted) == {
         "bus": {"interface": "socketcan", "channel": "can0", "bitrate_bit_s": 1_000_000},
@@ -84,7 +88,8 @@ def test_a_mechanism_that_does_not_close_is_refused_with_its_file(
     checkout: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = checkout / "configs/simulation"
-    (tmp_path / "five-bar-plant.urdf").write_bytes((folder / "five-bar-plant.urdf").read_bytes())
+    content = (folder / "five-bar-plant.urdf").read_bytes()
+    (tmp_path / "five-bar-plant.urdf").write_bytes(content)
     text = (
         (folder / "five-bar.yaml")
         .read_text(encoding="utf-8")
@@ -126,7 +131,9 @@ def test_a_pipe_names_no_body(tmp_path: Path) -> None:
         named.append(name)
         return clean_cell()
 
-    MountedFile(tmp_path / "body", load, lambda error: pytest.fail(str(error))).at_power_on()
+    path = tmp_path / "body"
+    mounted_file = MountedFile(path, load, lambda error: pytest.fail(str(error)))
+    mounted_file.at_power_on()
     assert named == [None]
 
 
@@ -178,7 +185,9 @@ def test_no_amplifiers_join_a_bus_on_which_a_recorder_moves_others(
         "drivers.canopen.bus.open_bus", lambda *_, **__: pytest.fail("the bus was opened")
     )
     cell = load_cell(checkout / "configs/cells/demo.yaml")
-    there = replace(cell, buses=(replace(cell.buses[0], interface="socketcan", channel="vcan9"),))
+    changed_buses = replace(cell.buses[0], interface="socketcan", channel="vcan9")
+    buses = (changed_buses,)
+    there = replace(cell, buses=buses)
     with bus_lock(there):
         command = ["simulate", "clean", "--interface", "socketcan", "--channel", "vcan9"]
         assert main(command) == ExitCode.BUS_TAKEN

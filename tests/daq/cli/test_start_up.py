@@ -72,11 +72,13 @@ def _loaded(code: str, names: tuple[str, ...], checkout: Path) -> list[str]:
         cwd=checkout,
         check=True,
     )
-    return done.stderr.splitlines()[-1].split()
+    last_line = done.stderr.splitlines()[-1]
+    return last_line.split()
 
 
 def test_no_help_waits_for_numerics_or_the_bus(checkout: Path) -> None:
-    assert _loaded(HELP, (*NUMERICS, "scipy", "numpy", "can", "canopen", "mcap"), checkout) == []
+    names = (*NUMERICS, "scipy", "numpy", "can", "canopen", "mcap")
+    assert _loaded(HELP, names, checkout) == []
 
 
 def test_an_error_as_text_waits_for_no_types_of_documents(checkout: Path) -> None:
@@ -100,21 +102,22 @@ def test_a_quick_verb_loads_only_libraries_that_it_uses(
         command = ["scan", "configs/cells/demo.yaml", "--wait", "0.05"]
         expected = ExitCode.DEVICE_FAULT
     elif verb == "info":
-        log = write(
-            tmp_path / "a.mcap", demo_content(checkout, DISC), samples([[k] * 6 for k in range(50)])
-        )
+        path = tmp_path / "a.mcap"
+        log = write(path, demo_content(checkout, DISC), samples([[k] * 6 for k in range(50)]))
         command = ["info", str(log)]
         expected = ExitCode.OK
     else:
         command = ["history", str(_cell_with_history(checkout, tmp_path))]
         expected = ExitCode.OK
     code += f"assert main({command!r}) == {int(expected)}\n"
-    assert _loaded(code, (*NUMERICS, *UNUSED[verb]), checkout) == []
+    names = (*NUMERICS, *UNUSED[verb])
+    assert _loaded(code, names, checkout) == []
 
 
 def _cell_with_history(checkout: Path, folder: Path) -> Path:
     kept = shutil.ignore_patterns("*.jsonl*", "*.sqlite*")
     shutil.copytree(checkout / "configs", folder / "configs", ignore=kept)
-    cell = folder / "configs" / "cells" / "demo.yaml"
+    cells_folder = folder / "configs" / "cells"
+    cell = cells_folder / "demo.yaml"
     fill(ledger_of(cell), 12, lambda _week: (1.0,) * 6)
     return cell

@@ -57,9 +57,9 @@ def test_bytes_of_a_name_that_are_no_characters_are_spelt_out() -> None:
 
 def _row(name: str, unit: str) -> FleetRow:
     gain = Gain(name, -3.5, 0.01, unit, -3.4)
-    return FleetRow(
-        name, "0" * 64, (name,), (), Summary((gain,), (), 3.0, False, False), 1.0, file=Path(name)
-    )
+    result = Summary((gain,), (), 3.0, False, False)
+    configuration_sha256 = "0" * 64
+    return FleetRow(name, configuration_sha256, (name,), (), result, 1.0, file=Path(name))
 
 
 @pytest.mark.parametrize("text", [*FORMULAS, "b\udcff"])
@@ -68,11 +68,13 @@ def test_the_table_of_a_fleet_has_no_formula_and_can_be_written(text: str) -> No
     made = fleet_csv(rows)
     assert made.encode().decode() == made
     assert made.startswith(",".join(FIRST_COLUMNS))
-    header, *lines = csv.reader(io.StringIO(made, newline=""))
+    string_io = io.StringIO(made, newline="")
+    header, *lines = csv.reader(string_io)
     for cell in [*header, *(cell for line in lines for cell in line)]:
         assert not cell.startswith(tuple("=+@\t\r\n"))
     assert len(lines) == 2
-    assert lines[0][header.index(inert(f"{text} gain"))] == "-3.5"  # numbers stay numbers
+    column = inert(f"{text} gain")
+    assert lines[0][header.index(column)] == "-3.5"  # numbers stay numbers
     assert json_text(fleet_report(rows)).encode()
 
 
@@ -80,21 +82,21 @@ def _watched(path: Path, times: tuple[datetime, ...], unit: str = "Nm/A") -> tup
     ledger = ledger_in(path)
     for number, time in enumerate(times):
         made = replace(calibration_of(number), created=time.isoformat())
+        gains = tuple(replace(gain, unit=unit) for gain in made.gains)
+        calibration = replace(made, gains=gains)
         enter(
             ledger,
-            recorded(
-                replace(made, gains=tuple(replace(gain, unit=unit) for gain in made.gains)), time
-            ),
+            recorded(calibration, time),
         )
     history = read_history(ledger)
     return watch(history.entries, history.acknowledgements)
 
 
 def test_the_table_of_a_history_has_no_formula(tmp_path: Path) -> None:
-    made = csv_text(
-        _watched(tmp_path, (datetime(2026, 1, 5, tzinfo=UTC),), unit="=cmd|'/c calc'!A1")
-    )
-    for row in csv.DictReader(io.StringIO(made, newline="")):
+    all_series = _watched(tmp_path, (datetime(2026, 1, 5, tzinfo=UTC),), unit="=cmd|'/c calc'!A1")
+    made = csv_text(all_series)
+    string_io = io.StringIO(made, newline="")
+    for row in csv.DictReader(string_io):
         assert row["unit"] == "'=cmd|'/c calc'!A1"
         assert float(row["gain"])
 
@@ -119,20 +121,26 @@ def _proposal(folder: Path, unit: str) -> Proposal[FileEdit]:
     file = folder / "robot.yaml"
     file.write_text("".join(f"{axis}: 30.0  # tab\t[/]\n" for axis in AXES))
     demo = demo_calibration()
-    made = replace(demo, gains=tuple(replace(gain, unit=unit) for gain in demo.gains))
+    gains = tuple(replace(gain, unit=unit) for gain in demo.gains)
+    made = replace(demo, gains=gains)
+    target = FileTarget(file, dict(zip(AXES, AXES, strict=True)))
+    now = datetime(2025, 1, 2, tzinfo=UTC)
     return propose(
-        FileTarget(file, dict(zip(AXES, AXES, strict=True))),
-        Request(made, datetime(2025, 1, 2, tzinfo=UTC)),
+        target,
+        Request(made, now),
     )
 
 
 @pytest.mark.parametrize("unit", ["[/]", "[red]Nm/A", "Nm\x1b[2J", "\x9b2J"])
 def test_a_unit_neither_commands_the_terminal_nor_is_markup(unit: str, tmp_path: Path) -> None:
     shown = io.StringIO()
-    show_proposal(_proposal(tmp_path, unit), Console(file=shown, width=200, force_terminal=False))
+    proposal = _proposal(tmp_path, unit)
+    console = Console(file=shown, width=200, force_terminal=False)
+    show_proposal(proposal, console)
     assert "\x1b" not in shown.getvalue()
     assert "\x9b" not in shown.getvalue()
-    assert unit.replace("\x1b", "\\x1b").replace("\x9b", "\\x9b") in shown.getvalue()
+    changed_unit = unit.replace("\x1b", "\\x1b")
+    assert changed_unit.replace("\x9b", "\\x9b") in shown.getvalue()
 
 
 @given(st.text())

@@ -47,14 +47,16 @@ def demo(checkout: Path, tmp_path: Path) -> Path:
 @pytest.fixture
 def log(checkout: Path, tmp_path: Path) -> Path:
     """A log of the demo cell, without load."""
-    return write(tmp_path / "bare.mcap", demo_content(checkout), ROWS)
+    path = tmp_path / "bare.mcap"
+    return write(path, demo_content(checkout), ROWS)
 
 
 def _copy(
     checkout: Path, folder: Path, change: Callable[[str], str], name: str = "cell.yaml"
 ) -> Path:
     text = (checkout / "configs/cells/demo.yaml").read_text(encoding="utf-8")
-    changed = change(text.replace("../", f"{checkout}/configs/"))
+    changed_text = text.replace("../", f"{checkout}/configs/")
+    changed = change(changed_text)
     path = folder / name
     path.write_text(changed, encoding="utf-8")
     return path
@@ -70,7 +72,8 @@ def _replaced(old: str, new: str) -> Callable[[str], str]:
 
 def _calibration(cell: str) -> Calibration:
     """A calibration of a cell with these axes, with every setting of its filter."""
-    document = Conditioning(standstill_rad_s=(0.03,) * 6).document()
+    standstill_rad_s = (0.03,) * 6
+    document = Conditioning(standstill_rad_s=standstill_rad_s).document()
     return replace(demo_calibration(), cell=cell, filter=document)
 
 
@@ -92,7 +95,8 @@ def test_another_cell_is_refused_with_what_shows_it(
     kind: str, checkout: Path, tmp_path: Path, log: Path
 ) -> None:
     change, message = OTHERS[kind]
-    other = load_cell(_copy(checkout, tmp_path, change))
+    path = _copy(checkout, tmp_path, change)
+    other = load_cell(path)
     with pytest.raises(
         LogsDiffer, match=f"{message}.*another robot's description gives wrong gains"
     ):
@@ -107,35 +111,39 @@ def test_a_log_of_exchanged_node_numbers_is_to_be_recorded_again(checkout: Path,
         replace(second, node_id=first.node_id),
         *others,
     )
+    changed_cell = replace(cell, axes=exchanged)
     with pytest.raises(
         LogsDiffer,
         match=r"drive of J1 with node id 1; .*; expected drive of J1 with node id 2; .*record "
         r"again with the corrected "
         r"cell file",
     ):
-        load_run(log, replace(cell, axes=exchanged))
+        load_run(log, changed_cell)
 
 
 @pytest.mark.parametrize("name", ["gantry", "dualv", "five-bar", "seven-axis"])
 def test_a_robot_with_another_number_of_axes_is_another_one(
     name: str, checkout: Path, log: Path
 ) -> None:
+    path = checkout / f"configs/cells/{name}.yaml"
     with pytest.raises(LogsDiffer, match=f"a log of cell 'demo'; expected one of cell '{name}'"):
-        load_run(log, load_cell(checkout / f"configs/cells/{name}.yaml"))
+        load_run(log, load_cell(path))
 
 
 def test_a_robot_with_another_number_of_axes_and_the_same_name_is_another_one(
     checkout: Path, log: Path
 ) -> None:
     gantry = load_cell(checkout / "configs/cells/gantry.yaml")
+    cell = replace(gantry, name="demo")
     with pytest.raises(LogsDiffer, match="axes J1, J2"):
-        load_run(log, replace(gantry, name="demo"))
+        load_run(log, cell)
 
 
 def test_a_correction_without_the_payload_of_the_log_is_refused(
     checkout: Path, tmp_path: Path
 ) -> None:
-    loaded = write(tmp_path / "loaded.mcap", demo_content(checkout, payload=DISC), ROWS)
+    path = tmp_path / "loaded.mcap"
+    loaded = write(path, demo_content(checkout, payload=DISC), ROWS)
     renamed = load_cell(_copy(checkout, tmp_path, _replaced("name: disc", "name: cube")))
     with pytest.raises(
         LogsDiffer, match="payload disc on flange-a, which the given description does not have"
@@ -150,7 +158,8 @@ def test_a_robot_with_other_joints_is_another_one(checkout: Path) -> None:
         ('type="revolute"', 'type="prismatic"'),
     ):
         assert old in demo.urdf
-        found = mismatch(demo, replace(demo, urdf=demo.urdf.replace(old, new, 1)))
+        urdf = demo.urdf.replace(old, new, 1)
+        found = mismatch(demo, replace(demo, urdf=urdf))
         assert found is not None
         assert "as in the given description" in found.expected
 
@@ -161,14 +170,16 @@ def test_drives_of_other_serial_numbers_are_of_another_robot(
     """The drives of this log reported the serial number 7, and its description names none."""
     unnamed = _copy(checkout, tmp_path, lambda text: re.sub(r", serial: \d+", "", text))
     content = replace(demo_content(checkout), files=bundle(unnamed))
-    log = write(tmp_path / "bare.mcap", content, ROWS)
+    path = tmp_path / "bare.mcap"
+    log = write(path, content, ROWS)
     declared = load_cell(checkout / "configs/cells/demo.yaml")
 
     def with_serial(serial: int) -> Cell:
         axes = load_cell(unnamed).axes
         assert axes[0].identity is not None
         identity = replace(axes[0].identity, serial=serial)
-        return replace(declared, axes=(replace(axes[0], identity=identity), *axes[1:]))
+        changed_axis = replace(axes[0], identity=identity)
+        return replace(declared, axes=(changed_axis, *axes[1:]))
 
     load_run(log, with_serial(7))
     with pytest.raises(
@@ -198,7 +209,8 @@ def test_a_corrected_description_is_taken_and_recorded(
     kind: str, checkout: Path, tmp_path: Path, log: Path
 ) -> None:
     change, sections = CORRECTIONS[kind]
-    corrected = load_cell(_copy(checkout, tmp_path, change))
+    path = _copy(checkout, tmp_path, change)
+    corrected = load_cell(path)
     run, described = load_run(log, corrected)
     assert described is corrected
     assert run.recording is not None
@@ -212,14 +224,15 @@ def test_a_corrected_description_is_taken_and_recorded(
 
 def test_geometry_ratio_and_zero_are_corrections(checkout: Path) -> None:
     demo = load_cell(checkout / "configs/cells/demo.yaml")
+    changed_axis = replace(demo.axes[-1], zero_offset_rad=0.2)
     axes = (
         replace(demo.axes[0], zero_offset_rad=0.1),
         *demo.axes[1:-1],
-        replace(demo.axes[-1], zero_offset_rad=0.2),
+        changed_axis,
     )
-    mended = replace(
-        demo, urdf=demo.urdf.replace("0.225", "0.2251"), ratio=2.0 * demo.ratio, axes=axes
-    )
+    urdf = demo.urdf.replace("0.225", "0.2251")
+    ratio = 2.0 * demo.ratio
+    mended = replace(demo, urdf=urdf, ratio=ratio, axes=axes)
     assert mended.urdf != demo.urdf
     assert mismatch(demo, mended) is None
     assert differing_sections(demo, mended) == (
@@ -234,7 +247,8 @@ def test_a_description_that_is_refused_now_can_be_corrected_by_one_of_its_name(
 ) -> None:
     files = bundle(demo)
     given = load_cell(demo)
-    broken = {**files, "cell.yaml": files["cell.yaml"].replace(b"node_id: 3", b"node_id: 2")}
+    changed_cell_yaml = files["cell.yaml"].replace(b"node_id: 3", b"node_id: 2")
+    broken = {**files, "cell.yaml": changed_cell_yaml}
     correction = correction_of("a.mcap", broken, given)
     assert correction is not None
     assert correction.sections == ("cell.yaml",)
@@ -246,22 +260,25 @@ def test_a_description_that_is_refused_now_can_be_corrected_by_one_of_its_name(
 def test_a_correction_is_said_once_for_logs_that_share_a_description(
     checkout: Path, tmp_path: Path, log: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
+    path = tmp_path / "loaded.mcap"
     loaded = write(
-        tmp_path / "loaded.mcap",
+        path,
         demo_content(checkout, DISC),
         samples([[k] * 6 for k in range(60)]),
     )
     corrected = load_cell(_copy(checkout, tmp_path, UPSIDE_DOWN))
     reading = LogLoader.of([log, loaded], corrected)
     list(reading.runs([log, loaded], "fit"))
-    assert [record.getMessage() for record in caplog.records] == [
+    messages = [record.getMessage() for record in caplog.records]
+    assert messages == [
         f"{log}: the given description of the cell replaces the one in the log; they differ in "
         "robot.gravity_m_s2"
     ]
     found = [
         source.recording.corrected for source in reading.sources if source.recording is not None
     ]
-    assert found == [("robot.gravity_m_s2",)] * 2
+    expected = [("robot.gravity_m_s2",)] * 2
+    assert found == expected
     # As the calibration keeps it.
     calibration = replace(demo_calibration(), sources=tuple(reading.sources))
     again: tuple[Source, ...] = decode_calibration(
@@ -274,7 +291,9 @@ def test_logs_of_two_descriptions_are_not_weighed_by_one_model(
     checkout: Path, tmp_path: Path, log: Path
 ) -> None:
     content = replace(demo_content(checkout), files=bundle(_copy(checkout, tmp_path, UPSIDE_DOWN)))
-    other = write(tmp_path / "other.mcap", content, samples([[k] * 6 for k in range(60)]))
+    rows = [[k] * 6 for k in range(60)]
+    path = tmp_path / "other.mcap"
+    other = write(path, content, samples(rows))
     calibration = _calibration("demo")
     with pytest.raises(
         LogsDiffer,
@@ -345,7 +364,8 @@ def test_every_verb_refuses_the_description_of_another_robot(
     }
     arguments, code = VERBS[verb]
     assert main([files.get(word, word) for word in arguments]) == code
-    said = " ".join(capsys.readouterr().err.split())
+    error_output = capsys.readouterr().err
+    said = " ".join(error_output.split())
     assert "'demo'" in said
     assert "'press'" in said
 
@@ -406,9 +426,11 @@ def test_every_verb_refuses_a_calibration_of_another_robot_with_the_same_name(
     monkeypatch.chdir(tmp_path)
     change, said = SAME_NAME[different]
     own = _copy(checkout, tmp_path, lambda text: text)
-    other = load_cell(_copy(checkout, tmp_path, change, "other.yaml"))
+    path = _copy(checkout, tmp_path, change, "other.yaml")
+    other = load_cell(path)
     of_other = tmp_path / "other-calibration.yaml"
-    save_calibration(replace(_calibration("demo"), robot=calibrated_robot(other)), of_other)
+    calibration = replace(_calibration("demo"), robot=calibrated_robot(other))
+    save_calibration(calibration, of_other)
     of_own = tmp_path / "own-calibration.yaml"
     save_calibration(replace(_calibration("demo"), robot=calibrated_robot(load_cell(own))), of_own)
     files = {"LOG": str(log), "CELL": str(own), "CALIBRATION": str(of_other), "OWN": str(of_own)}
@@ -425,7 +447,8 @@ def test_a_calibration_names_the_joint_in_which_its_robot_differs(checkout: Path
     demo = load_cell(checkout / "configs/cells/demo.yaml")
     calibration = replace(_calibration("demo"), robot=calibrated_robot(demo))
     assert mismatch_of_calibration(calibration, demo) is None
-    sliding = replace(demo, urdf=demo.urdf.replace('type="revolute"', 'type="prismatic"', 1))
+    urdf = demo.urdf.replace('type="revolute"', 'type="prismatic"', 1)
+    sliding = replace(demo, urdf=urdf)
     found = mismatch_of_calibration(calibration, sliding)
     assert found is not None
     assert found.found == (
@@ -439,13 +462,15 @@ def test_what_a_description_corrects_or_leaves_open_makes_no_other_robot(checkou
     calibration = replace(_calibration("demo"), robot=calibrated_robot(demo))
     first = demo.axes[0]
     assert first.identity is not None
-    exchanged = replace(first, identity=replace(first.identity, serial=99))
+    identity = replace(first.identity, serial=99)
+    exchanged = replace(first, identity=identity)
     unnamed = replace(first, identity=None)
     for axis in (exchanged, unnamed, replace(first, zero_offset_rad=0.1)):
-        assert (
-            mismatch_of_calibration(calibration, replace(demo, axes=(axis, *demo.axes[1:]))) is None
-        )
-    lengthened = replace(demo, urdf=demo.urdf.replace("0.225", "0.2251"))
+        axes = (axis, *demo.axes[1:])
+        cell = replace(demo, axes=axes)
+        assert mismatch_of_calibration(calibration, cell) is None
+    urdf = demo.urdf.replace("0.225", "0.2251")
+    lengthened = replace(demo, urdf=urdf)
     assert mismatch_of_calibration(calibration, lengthened) is None
     # Files of earlier versions do not name their robot.
     assert (
@@ -455,18 +480,22 @@ def test_what_a_description_corrects_or_leaves_open_makes_no_other_robot(checkou
 
 
 def _without_vendors(cell: Cell) -> Cell:
-    return replace(cell, axes=tuple(replace(axis, identity=None) for axis in cell.axes))
+    axes = tuple(replace(axis, identity=None) for axis in cell.axes)
+    return replace(cell, axes=axes)
 
 
 def _with_another_vendor(cell: Cell) -> Cell:
     first = cell.axes[0]
     assert first.identity is not None
-    identity = replace(first.identity, vendor_id=first.identity.vendor_id + 1)
-    return replace(cell, axes=(replace(first, identity=identity), *cell.axes[1:]))
+    vendor_id = first.identity.vendor_id + 1
+    identity = replace(first.identity, vendor_id=vendor_id)
+    axes = (replace(first, identity=identity), *cell.axes[1:])
+    return replace(cell, axes=axes)
 
 
 def _with_a_sliding_joint(cell: Cell) -> Cell:
-    return replace(cell, urdf=cell.urdf.replace('type="revolute"', 'type="prismatic"', 1))
+    urdf = cell.urdf.replace('type="revolute"', 'type="prismatic"', 1)
+    return replace(cell, urdf=urdf)
 
 
 def _with_another_parent(cell: Cell) -> Cell:
@@ -494,7 +523,9 @@ def test_logs_plans_and_calibrations_agree_on_what_one_robot_is(
     for made_with, used_with in ((demo, change(demo)), (change(demo), demo)):
         calibration = replace(_calibration("demo"), robot=calibrated_robot(made_with))
         plan_file = tmp_path / "plan.yaml"
-        move = PlannedMove((0.0,) * 6, velocity=0.1, acceleration=0.1, dwell_s=0.1)
+        target_rad = (0.0,) * 6
+        move = PlannedMove(target_rad, velocity=0.1, acceleration=0.1, dwell_s=0.1)
+        units = tuple(axis.unit for axis in demo.axes)
         made = Plan(
             cell="demo",
             seed=1,
@@ -502,7 +533,7 @@ def test_logs_plans_and_calibrations_agree_on_what_one_robot_is(
             predicted_std_percent=(),
             duration_s=1.0,
             moves=(move,),
-            units=tuple(axis.unit for axis in demo.axes),
+            units=units,
             robot=calibrated_robot(made_with),
         )
         save_plan(made, plan_file)
@@ -522,8 +553,10 @@ def test_logs_plans_and_calibrations_agree_on_what_one_robot_is(
 
 
 def test_a_robot_with_fewer_axes_is_named_by_its_axes(checkout: Path) -> None:
-    robot = calibrated_robot(load_cell(checkout / "configs/cells/demo.yaml"))
-    (difference,) = robot_differences(replace(robot, drives=robot.drives[:2]), robot)
+    path = checkout / "configs/cells/demo.yaml"
+    robot = calibrated_robot(load_cell(path))
+    changed_robot = replace(robot, drives=robot.drives[:2])
+    (difference,) = robot_differences(changed_robot, robot)
     assert difference.found == "axes J1, J2"
     assert difference.expected == "axes J1, J2, J3, J4, J5, J6"
 
@@ -531,7 +564,8 @@ def test_a_robot_with_fewer_axes_is_named_by_its_axes(checkout: Path) -> None:
 def test_a_calibration_keeps_the_robot_that_it_is_of(checkout: Path) -> None:
     demo = load_cell(checkout / "configs/cells/demo.yaml")
     robot = calibrated_robot(demo)
-    content = encode_calibration(replace(_calibration("demo"), robot=robot))
+    calibration = replace(_calibration("demo"), robot=robot)
+    content = encode_calibration(calibration)
     assert decode_calibration(content, "calibration.yaml").robot == robot
     assert f"robot:\n  kinematics_sha256: {robot.kinematics_sha256}".encode() in content
 

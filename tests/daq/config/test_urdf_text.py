@@ -76,7 +76,8 @@ def test_a_cell_is_read_with_links_that_only_the_declaration_tells_apart(cell_pa
         body = text.partition("?>")[2]
     else:
         body = text
-    urdf.write_bytes((_declaration("ISO-8859-1") + body).encode("latin-1"))
+    encoded_body = (_declaration("ISO-8859-1") + body).encode("latin-1")
+    urdf.write_bytes(encoded_body)
     assert "Ö" in load_cell(cell_path).urdf
 
 
@@ -95,7 +96,8 @@ def test_a_cell_is_read_with_links_that_only_the_declaration_tells_apart(cell_pa
 def test_the_advice_is_about_the_urdf(
     cell_path: Path, content: str, found: str, expected: str
 ) -> None:
-    (cell_path.parents[1] / "robots/rx90.urdf").write_text(content, encoding="utf-8")
+    rx90_path = cell_path.parents[1] / "robots/rx90.urdf"
+    rx90_path.write_text(content, encoding="utf-8")
     with pytest.raises(ConfigurationInconsistent) as caught:
         load_cell(cell_path)
     assert found in caught.value.found

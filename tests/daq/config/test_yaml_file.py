@@ -44,13 +44,15 @@ class _File(StrictModel):
 
 
 def _read(text: str) -> _File:
-    return read_model(parse_yaml(text.encode(), "file.yaml"), _File)
+    document = parse_yaml(text.encode(), "file.yaml")
+    return read_model(document, _File)
 
 
 def test_a_good_file_is_read() -> None:
     file = _read("axes:\n  - {name: J1, limits: {velocity_deg_s: 1e-3, range_deg: [-1, 2]}}\n")
     assert file.axes[0].limits.velocity_deg_s == 1e-3
-    assert file.axes[0].limits.range_deg == (-1.0, 2.0)
+    expected = (-1.0, 2.0)
+    assert file.axes[0].limits.range_deg == expected
 
 
 @pytest.mark.parametrize(
@@ -129,9 +131,8 @@ def test_the_remedy_names_a_page_with_every_key(model: type[StrictModel], checko
         read_model(parse_yaml(b"colour: red\n", "file.yaml"), model)
     page = checkout / "docs/reference" / model.reference
     assert f"docs/reference/{page.name} has every key" in caught.value.remedy
-    assert re.search(
-        "^<!-- generated: (cell file|schemas) -->$", page.read_text(encoding="utf-8"), re.MULTILINE
-    )
+    text = page.read_text(encoding="utf-8")
+    assert re.search("^<!-- generated: (cell file|schemas) -->$", text, re.MULTILINE)
 
 
 @pytest.mark.parametrize(
@@ -200,7 +201,8 @@ def test_a_name_with_other_characters_is_refused_in_words() -> None:
     ],
 )
 def test_scalars_are_those_of_yaml_1_2(text: str, value: object) -> None:
-    assert parse_yaml(f"a: {text}\n".encode(), "file.yaml").tree == {"a": value}
+    yaml = parse_yaml(f"a: {text}\n".encode(), "file.yaml")
+    assert yaml.tree == {"a": value}
 
 
 @given(st.binary(max_size=200))
@@ -251,4 +253,6 @@ def test_an_integer_that_nothing_can_hold_is_reported(text: str) -> None:
 @given(st.integers(-(2**64) + 1, 2**64 - 1))
 def test_every_other_integer_is_what_was_written(value: int) -> None:
     written = f"0x{value:x}" if value >= 0 else str(value)
-    assert parse_yaml(f"a: {written}".encode(), "x").tree == {"a": value}
+    text = f"a: {written}".encode()
+    tree = parse_yaml(text, "x").tree
+    assert tree == {"a": value}

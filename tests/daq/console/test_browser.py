@@ -86,7 +86,8 @@ class Rig:
         self.stack = stack
         (folder / "faults.yaml").write_text(faults, encoding="utf-8")
         shutil.copytree(checkout / "configs", folder / "configs")
-        self.cell_file = folder / "configs" / "cells" / "demo.yaml"
+        cells_folder = folder / "configs" / "cells"
+        self.cell_file = cells_folder / "demo.yaml"
         given = ("--faults", str(folder / "faults.yaml")) if faults else ()
         simulation = self.start("simulate", *simulated, "--port", "0", *given)
         assert simulation.stdout is not None
@@ -116,7 +117,8 @@ class Rig:
         save_calibration(predicting_calibration(), calibration)
         self.console = self.start("console", str(self.cell_file), "--calibration", str(calibration))
         assert self.console.stdout is not None
-        self.address = re.findall(r"http\S+", self.console.stdout.readline())[0]
+        matches = re.findall(r"http\S+", self.console.stdout.readline())
+        self.address = matches[0]
         self.refused: list[str] = []
         self.page = self.opened(browser, width=1280, height=1000)
 
@@ -159,7 +161,8 @@ class Rig:
         if self.log.exists():
             return read_log(self.log)
         saved = self.folder / "saved.mcap"
-        salvage(self.log.with_name(self.log.name + ".part"), saved)
+        damaged = self.log.with_name(self.log.name + ".part")
+        salvage(damaged, saved)
         return read_log(saved)
 
     def shown(self) -> dict[str, Any]:
@@ -200,8 +203,10 @@ def test_a_recording_with_a_fault_is_shown_as_its_log_holds_it(
         status = shown["status"]
         assert status["samples"] == len(log.samples.cycle)
         assert status["missing"] == sum(log.statistics.missing) > 0
-        assert (status["lost"], status["dropped"]) == (log.statistics.lost_cycles, 0)
-        assert [axis["state"] for axis in status["axes"]].count("OPERATION ENABLED") == 0
+        expected = (log.statistics.lost_cycles, 0)
+        assert (status["lost"], status["dropped"]) == expected
+        states = [axis["state"] for axis in status["axes"]]
+        assert states.count("OPERATION ENABLED") == 0
         # The points: every twentieth cycle of 1 kHz, with the values of the log.
         of_page = log.samples.cycle % 20 == 0
         scale = scaling(made.cell, log.head.readback)
@@ -212,7 +217,8 @@ def test_a_recording_with_a_fault_is_shown_as_its_log_holds_it(
         assert len(points) == shown["received"] == np.count_nonzero(of_page) > 100
         np.testing.assert_allclose(points[:, 1:7], position[of_page], rtol=0.0, atol=1e-12)
         np.testing.assert_allclose(points[:, 7:], current[of_page], rtol=0.0, atol=1e-12)
-        np.testing.assert_allclose(np.diff(points[:, 0]), 0.02, atol=1e-6)
+        points_steps = np.diff(points[:, 0])
+        np.testing.assert_allclose(points_steps, 0.02, atol=1e-6)
         # The events, in words and with the remedy.
         texts = [event.text for event in log.events]
         names = made.cell.axis_names
@@ -261,7 +267,8 @@ def test_the_button_stops_the_axes_and_the_page_says_so(
         )
         shown = made.shown()
         log = made.kept()
-        assert shown["status"]["samples"] == len(log.samples.cycle)
+        samples = shown["status"]["samples"]
+        assert samples == len(log.samples.cycle)
         assert shown["status"]["end"]["axes_stopped"]
         assert made.page.is_disabled("#stop")
         # Predicted where the arm moves; this calibration is the declared model, so only its being
@@ -303,7 +310,8 @@ def test_a_page_of_another_site_reads_nothing_and_stops_nothing(
 def test_a_preview_is_a_right_handed_view_from_above(
     tmp_path: Path, checkout: Path, browser: Browser
 ) -> None:
-    cell = checkout / "configs" / "cells" / "demo.yaml"
+    cells_folder = checkout / "configs" / "cells"
+    cell = cells_folder / "demo.yaml"
     preview = tmp_path / "plan.html"
     planned = [
         "plan",
@@ -334,13 +342,16 @@ def test_a_preview_is_a_right_handed_view_from_above(
         scale = page.evaluate("camera(400, 400)[2]")
         # Right, up, and towards the viewer are a right-handed frame, so the images of x, y, z must
         # be one as well.
-        axes = np.stack([one - origin for one in (x, y, z)]) * np.array(
-            [1 / scale, -1 / scale, 1.0]
-        )
+        origins = [one - origin for one in (x, y, z)]
+        stacked_origins = np.stack(origins)
+        axes = stacked_origins * np.array([1 / scale, -1 / scale, 1.0])
         np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-9)
-        assert np.linalg.det(axes) == pytest.approx(1.0)
+        axes_determinant = np.linalg.det(axes)
+        assert axes_determinant == pytest.approx(1.0)
         assert axes[2, 2] >= -1e-9  # seen from the side or from above, never from below
-    page.screenshot(path=checkout / "out" / "console" / "preview.png", full_page=True)
+    console_folder = checkout / "out" / "console"
+    path = console_folder / "preview.png"
+    page.screenshot(path=path, full_page=True)
     page.close()
     assert faults == []
 
@@ -382,13 +393,14 @@ def test_a_bar_is_red_for_a_reason(tmp_path: Path, checkout: Path, browser: Brow
         share: text.partition(" deg, ")[2].partition("current")[0]
         for share, (text, _) in texts.items()
     }
-    assert said == {
+    expected = {
         -0.01: "below its lower limit, ",
         0.01: "near its lower limit, ",
         0.5: "",
         0.99: "near its upper limit, ",
         1.01: "above its upper limit, ",
     }
+    assert said == expected
     assert [red for _, red in texts.values()] == [True, True, False, True, True]
 
 
@@ -412,12 +424,14 @@ def _pictures(made: Rig, browser: Browser, checkout: Path) -> None:
     out = checkout / "out" / "console"
     out.mkdir(parents=True, exist_ok=True)
     clip: FloatRect = {"x": 0, "y": 0, "width": 1280, "height": 1240}
-    made.page.screenshot(path=out / "desktop.png", clip=clip, full_page=True)
+    path = out / "desktop.png"
+    made.page.screenshot(path=path, clip=clip, full_page=True)
     phone = made.opened(browser, width=390, height=844)
     phone.emulate_media(color_scheme="dark")
     until(phone, "window.drivegain.points.length > 100")
     phone.wait_for_timeout(500)
-    phone.screenshot(path=out / "phone.png", full_page=True)
+    phone_path = out / "phone.png"
+    phone.screenshot(path=phone_path, full_page=True)
     for width in (390, 320):
         phone.set_viewport_size({"width": width, "height": 844})
         assert phone.evaluate("document.documentElement.scrollWidth") <= width
@@ -461,7 +475,8 @@ def _state_after_three_blocks(cell: Cell, folder: Path) -> None:
         )
         for axis in cell.axes
     )
-    progress = Progress(blocks=3, motion_s=60.0, fitted_s=40.0, std_percent=(0.9,) * len(gains))
+    std_percent = (0.9,) * len(gains)
+    progress = Progress(blocks=3, motion_s=60.0, fitted_s=40.0, std_percent=std_percent)
     state = GuidedState(
         session=folder.name,
         cell=cell.name,
@@ -496,14 +511,20 @@ def test_the_session_shows_the_gains_after_each_move(
         # A console is connected before the feed accepts it: what is published in between is for
         # nobody.
         assert accepted.wait(HEARD_S)
-        recording = Recording(feed, cell, folder / "block-4-loaded.mcap")
+        log = folder / "block-4-loaded.mcap"
+        recording = Recording(feed, cell, log)
         for number in (1, 2):
-            feed.look(replace(look, move=number, motion_s=40.0 + 4.0 * number))
+            motion_s = 40.0 + 4.0 * number
+            changed_look = replace(look, move=number, motion_s=motion_s)
+            feed.look(changed_look)
             recording.run(50)
+            condition = (
+                "document.getElementById('outlook').textContent.includes('after move "
+                f"{number} of 9')"
+            )
             until(
                 page,
-                "document.getElementById('outlook').textContent.includes('after move "
-                f"{number} of 9')",
+                condition,
             )
         assert page.inner_text("#next-step") == "The robot moves: block-4-loaded"
         assert "J1 is worst (it needs more moves): about 69 s left" in page.inner_text("#outlook")
@@ -539,7 +560,8 @@ class Technician:
 
     def asked_for(self) -> str:
         """What the last heading asks for: `NOTHING on the flange`."""
-        heading = re.findall(r"── \S+: (.+) ──", self.said)[-1]
+        matches = re.findall(r"── \S+: (.+) ──", self.said)
+        heading = matches[-1]
         return str(heading)
 
     def mount(self) -> None:
@@ -590,10 +612,9 @@ def test_a_whole_session_is_shown_as_its_files_hold_it(
         technician = Technician(command, mounted)
         while (question := technician.asked()) is not None:
             if "press Enter" in question and "cell" in question:
-                until(
-                    page,
-                    f"document.getElementById('next-step').textContent.startsWith('{technician.asked_for()}')",
-                )
+                step = technician.asked_for()
+                next_step = "document.getElementById('next-step').textContent"
+                until(page, f"{next_step}.startsWith('{step}')")
                 technician.mount()
                 _precision_is_that_of(page, newest_state(made.cell_file, made.cell))
             elif question.startswith("Type yes"):
@@ -609,8 +630,10 @@ def test_a_whole_session_is_shown_as_its_files_hold_it(
         for run in state.runs:
             assert run.name in page.inner_text("#stage")
         _precision_is_that_of(page, state)
-        (checkout / "out" / "console").mkdir(parents=True, exist_ok=True)
-        page.screenshot(path=checkout / "out" / "console" / "session.png", full_page=True)
+        console_folder = checkout / "out" / "console"
+        console_folder.mkdir(parents=True, exist_ok=True)
+        path = checkout / "out" / "console" / "session.png"
+        page.screenshot(path=path, full_page=True)
         assert made.refused == []
 
 
@@ -618,7 +641,8 @@ def _precision_is_that_of(page: Page, state: GuidedState) -> None:
     """The picture has σ of each gain after each judged block, and the last of each in words."""
     if not state.progress:
         return
-    until(page, f"window.drivegain.guided?.precision?.progress.length === {len(state.progress)}")
+    condition = f"window.drivegain.guided?.precision?.progress.length === {len(state.progress)}"
+    until(page, condition)
     assert page.locator("#precision circle:not(.quick)").count() == len(state.progress) * len(
         state.gains
     )

@@ -81,20 +81,22 @@ def test_a_packet_that_does_not_fit_is_one_kind_of_error(
 
 def test_keys_of_a_later_version_are_ignored(cell: Cell, cell_file: Path) -> None:
     live = Live(cell_file, cell)
-    live.take(_text({**_run(cell, of_tomorrow=1), "of_tomorrow": 2}))
+    message = {**_run(cell, of_tomorrow=1), "of_tomorrow": 2}
+    live.take(_text(message))
     live.take(_samples(len(cell.axes), 1))
     assert (live.phase, live.samples) == ("running", 1)
 
 
 def test_a_look_at_the_gains_is_shown_until_the_next_run(cell: Cell, cell_file: Path) -> None:
-    look = QuickLook(
-        "block-2-loaded", 3, 9, 31.0, gains=[QuickGain("J1", "Nm/A", 33.9, 0.4, 0.5)], left_s=12.0
-    )
+    gains = [QuickGain("J1", "Nm/A", 33.9, 0.4, 0.5)]
+    look = QuickLook("block-2-loaded", 3, 9, 31.0, gains=gains, left_s=12.0)
     live = Live(cell_file, cell)
     live.take(_text(_run(cell)))
     assert live.status()["quick"] is None
-    live.take(_text({"quick": asdict(look)}))
-    assert live.status()["quick"] == asdict(look)
+    message = {"quick": asdict(look)}
+    live.take(_text(message))
+    quick = live.status()["quick"]
+    assert quick == asdict(look)
     live.take(_text(_run(cell)))
     assert live.status()["quick"] is None
 
@@ -128,7 +130,8 @@ def test_a_recorder_of_another_version_is_said_and_the_next_one_is_shown(
 ) -> None:
     with served(cell_file, cell) as console:
         live = console.live
-        with _other_program(cell_file, _text(_run(cell, rate_hz="fast"))):
+        message = _run(cell, rate_hz="fast")
+        with _other_program(cell_file, _text(message)):
             live.wait(lambda: "cannot show the recorder" in live.status()["alarm"])
             assert facts_of_recorder(cell_file, 10.0) is None  # monitor goes on with its own
             assert live.phase == "running"  # so that the page's button can stop it
@@ -153,7 +156,8 @@ def test_a_background_task_that_ends_is_said(cell: Cell, cell_file: Path) -> Non
         raise LookupError("a defect")
 
     async def lived() -> None:
-        page = Page(cell, live, Results(cell_file, cell), broken)
+        results = Results(cell_file, cell)
+        page = Page(cell, live, results, broken)
         async with page._background(Starlette()):
             while not live.failed:
                 await asyncio.sleep(0)
@@ -173,7 +177,8 @@ def test_a_recorder_that_hangs_is_said_and_its_states_are_marked_as_old(
     assert live.status()["alarm"] == ""  # the drives are prepared
     for number in range(10):
         now_s[0] += 0.02
-        live.take(_samples(len(cell.axes), 1, so_far=10 * number))
+        so_far = 10 * number
+        live.take(_samples(len(cell.axes), 1, so_far=so_far))
     fresh = live.status()
     assert (fresh["alarm"], fresh["old"], fresh["rate_hz"] > 0.0) == ("", False, True)
     now_s[0] += 4.1
@@ -183,7 +188,8 @@ def test_a_recorder_that_hangs_is_said_and_its_states_are_marked_as_old(
     assert (old["old"], old["rate_hz"]) == (True, 0.0)
     live.take(_samples(len(cell.axes), 1, so_far=91))
     assert live.status()["old"] is False
-    live.take(_text({"result": {"valid": True, "reason": "", "samples": 91}}))
+    message = {"result": {"valid": True, "reason": "", "samples": 91}}
+    live.take(_text(message))
     now_s[0] += 60.0
     assert live.status()["alarm"] == ""  # between two runs of a job
 
@@ -201,7 +207,9 @@ def test_a_stop_is_forgotten_when_the_next_recorder_begins(cell: Cell, cell_file
                 assert accepted.wait(30)
                 recording.run(100)
                 live.wait(lambda: live.samples == 100 and live.stop_state is None)
-                assert json.loads(console.ask(f"/{TOKEN}/stop", "POST", origin=own)[1])["accepted"]
+                path = f"/{TOKEN}/stop"
+                document = json.loads(console.ask(path, "POST", origin=own)[1])
+                assert document["accepted"]
                 assert asked.wait(30), number
             live.wait(lambda: bool(live.stop_state and live.stop_state.get("axes_stopped")))
 
@@ -209,10 +217,14 @@ def test_a_stop_is_forgotten_when_the_next_recorder_begins(cell: Cell, cell_file
 def test_a_simulated_cell_in_lockstep_has_no_load_of_a_bus(cell: Cell, cell_file: Path) -> None:
     assert cell.sync is not None
     for pacing, buses in ((PacingMode.LOCKSTEP, set()), (PacingMode.TIMED, {"can0"})):
-        live = Live(cell_file, replace(cell, sync=replace(cell.sync, pacing=pacing)))
+        sync = replace(cell.sync, pacing=pacing)
+        changed_cell = replace(cell, sync=sync)
+        live = Live(cell_file, changed_cell)
         live.take(_text(_run(cell)))
-        assert live.status()["bus_load"].keys() == buses
-        assert live.status()["simulated"] is (pacing is PacingMode.LOCKSTEP)
+        bus_load = live.status()["bus_load"]
+        assert bus_load.keys() == buses
+        simulated = live.status()["simulated"]
+        assert simulated is (pacing is PacingMode.LOCKSTEP)
 
 
 @pytest.mark.parametrize("pacing", PacingMode)
@@ -224,7 +236,8 @@ def test_the_sample_rate_is_that_of_the_cells_own_time(
     """
     assert cell.sync is not None
     now_s = [0.0]
-    declared = replace(cell, sync=replace(cell.sync, pacing=pacing))
+    sync = replace(cell.sync, pacing=pacing)
+    declared = replace(cell, sync=sync)
     live = Live(cell_file, declared, clock=lambda: now_s[0])
     live.take(_text(_run(cell)))
     live.take(_samples(len(cell.axes), 1, so_far=0))
@@ -232,10 +245,10 @@ def test_the_sample_rate_is_that_of_the_cells_own_time(
     assert live.status()["rate_hz"] == 0.0  # two packets at once are no rate
     for number in range(40):
         now_s[0] += 0.02
-        live.take(_samples(len(cell.axes), 1, so_far=15 * number))
+        so_far = 15 * number
+        live.take(_samples(len(cell.axes), 1, so_far=so_far))
     assert live.run is not None
     measured = live.rate_hz
     assert measured > 1.2 * live.run.rate_hz
-    assert live.status()["rate_hz"] == (
-        live.run.rate_hz if pacing is PacingMode.LOCKSTEP else round(measured, 1)
-    )
+    rate_hz = live.status()["rate_hz"]
+    assert rate_hz == (live.run.rate_hz if pacing is PacingMode.LOCKSTEP else round(measured, 1))

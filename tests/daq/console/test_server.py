@@ -41,12 +41,14 @@ def console(cell: Cell, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Se
     folder = tmp_path_factory.mktemp("console")
     (folder / "report.html").write_text("<p>the report</p>")
     (folder / "secret.txt").write_text("secret")
-    with served(folder / "cell.yaml", cell, folder) as one:
+    cell_file = folder / "cell.yaml"
+    with served(cell_file, cell, folder) as one:
         yield one
 
 
 def test_the_page_loads_nothing_from_elsewhere_and_runs_no_inline_script(console: Served) -> None:
-    answer, page = console.ask(f"/{TOKEN}/")
+    path = f"/{TOKEN}/"
+    answer, page = console.ask(path)
     assert answer.status == 200
     policy = answer.headers["content-security-policy"]
     assert (
@@ -80,10 +82,11 @@ def test_a_question_about_the_whole_server_is_refused_like_any_other(console: Se
     "host", ["evil.example", "127.0.0.1", "127.0.0.1:1", "localhost.evil.example", "[::1]"]
 )
 def test_a_name_that_was_bound_to_this_computer_is_refused(console: Served, host: str) -> None:
-    assert console.ask(f"/{TOKEN}/", host=host)[0].status == 421
-    assert (
-        console.ask(f"/{TOKEN}/stop", "POST", host=host, origin=f"http://{host}")[0].status == 421
-    )
+    path = f"/{TOKEN}/"
+    status = console.ask(path, host=host)[0].status
+    assert status == 421
+    origin = f"http://{host}"
+    assert console.ask(f"/{TOKEN}/stop", "POST", host=host, origin=origin)[0].status == 421
 
 
 def test_another_origin_can_neither_read_nor_stop(console: Served) -> None:
@@ -93,9 +96,12 @@ def test_another_origin_can_neither_read_nor_stop(console: Served) -> None:
         {"origin": "null"},
         {"sec_fetch_site": "cross-site"},
     ):
-        assert console.ask(f"/{TOKEN}/cell", **headers)[0].status == 403
-    for headers in ({}, {"origin": "null"}, {"origin": own.replace("http", "https")}):
-        assert console.ask(f"/{TOKEN}/stop", "POST", **headers)[0].status == 403
+        path = f"/{TOKEN}/cell"
+        assert console.ask(path, **headers)[0].status == 403
+    changed_own = own.replace("http", "https")
+    for headers in ({}, {"origin": "null"}, {"origin": changed_own}):
+        status = console.ask(f"/{TOKEN}/stop", "POST", **headers)[0].status
+        assert status == 403
     assert console.ask(f"/{TOKEN}/stop", origin=own)[0].status == 405  # a link stops nothing
     answer, content = console.ask(f"/{TOKEN}/stop", "POST", origin=own)
     assert answer.status == 200
@@ -114,7 +120,8 @@ def test_no_path_leads_to_a_file(console: Served, path: str) -> None:
 
 
 def test_the_report_runs_no_script(console: Served) -> None:
-    answer, content = console.ask(f"/{TOKEN}/report")
+    path = f"/{TOKEN}/report"
+    answer, content = console.ask(path)
     assert content == b"<p>the report</p>"
     assert answer.headers["content-security-policy"].startswith("sandbox; default-src 'none'")
 
@@ -135,18 +142,19 @@ def test_a_reader_that_stalls_delays_neither_another_nor_a_stop(
                 recording.run(100)
                 while b"data: " not in (line := lines.readline()):
                     pass
-                shown += json.loads(line[6:])["new"].get("points", [])
+                document = json.loads(line[6:])
+                shown += document["new"].get("points", [])
                 console.live.wait(lambda: console.live.samples == recording.samples)
             own = f"http://127.0.0.1:{console.port}"
-            answer, content = console.ask(f"/{TOKEN}/stop", "POST", origin=own)
+            path = f"/{TOKEN}/stop"
+            answer, content = console.ask(path, "POST", origin=own)
             assert answer.status == 200
             assert json.loads(content)["accepted"]
             assert stopped.wait(10)
         # Every tenth sample of 500 Hz, with its values.
         first = round(shown[0][0] * 500)
-        assert [round(500 * point[0]) for point in shown] == [
-            first + 10 * step for step in range(len(shown))
-        ]
+        expected = [first + 10 * step for step in range(len(shown))]
+        assert [round(500 * point[0]) for point in shown] == expected
         assert console.live.dropped == 0
     degree = cell.axes[0].unit.si
     for point in shown[:50]:
@@ -168,14 +176,16 @@ def test_a_monitor_is_shown_until_a_recorder_begins_and_again_after_it(
         live.wait(lambda: live.samples == 100)
         assert (live.phase, live.run is not None and live.run.log) == ("watching", None)
         shown = live.status()
-        assert shown["axes"][0]["state"] == "OPERATION ENABLED"
+        state = shown["axes"][0]["state"]
+        assert state == "OPERATION ENABLED"
         assert shown["free_bytes"] is None
         assert len(live.points.since(0)) == 10
         assert shown["bus_load"] == {}  # nothing is computed where another master sends
         watching.measured({"can0": 0.25})
         live.wait(lambda: live.status()["bus_load"] == {"can0": 0.25})
         own = f"http://127.0.0.1:{console.port}"
-        _, content = console.ask(f"/{TOKEN}/stop", "POST", origin=own)
+        path = f"/{TOKEN}/stop"
+        _, content = console.ask(path, "POST", origin=own)
         assert not json.loads(content)["accepted"]  # nothing of a monitor's can be stopped
         came = arrivals(watching)
         feed = Feed(cell_file, lambda: None)
@@ -185,21 +195,20 @@ def test_a_monitor_is_shown_until_a_recorder_begins_and_again_after_it(
             recording = Recording(feed, cell, cell_file)
             recording.run(50)
             live.wait(lambda: live.phase == "running" and live.samples == 50)
-            assert live.status()["bus_load"] != {"can0": 0.25}
+            bus_load = live.status()["bus_load"]
+            assert bus_load != {"can0": 0.25}
             feed.finish()
         assert came.wait(30)
         monitor.run(100)
         live.wait(lambda: live.phase == "watching" and live.samples == 200)
         # How the recording ended stays on the page; the monitor's end does not replace it.
         assert (live.end or {})["ok"] and (live.result or {})["valid"]
-        watching.event(CellEvent(0, 2, EventKind.EMCY, 0x7305, "J3 (node 3): EMCY 7305h"))
+        cell_event = CellEvent(0, 2, EventKind.EMCY, 0x7305, "J3 (node 3): EMCY 7305h")
+        watching.event(cell_event)
         live.wait(lambda: live.events.end == 1)
         (event,) = live.events.since(0)
-        assert (event["axis"], event["text"], event["remedy"]) == (
-            "J3",
-            "EMCY 7305h",
-            for_command_line(remedy_of(0x7305)),
-        )
+        expected = ("J3", "EMCY 7305h", for_command_line(remedy_of(0x7305)))
+        assert (event["axis"], event["text"], event["remedy"]) == expected
     assert watching.remark == feed.remark == ""
 
 
@@ -209,7 +218,9 @@ def test_connections_without_a_request_do_not_hold_back_a_stop(console: Served) 
             closing.enter_context(socket.create_connection(("127.0.0.1", console.port), timeout=30))
             for _ in range(2 * CONNECTIONS)
         ]
-        answer, _ = console.ask(f"/{TOKEN}/stop", "POST", origin=f"http://127.0.0.1:{console.port}")
+        path = f"/{TOKEN}/stop"
+        origin = f"http://127.0.0.1:{console.port}"
+        answer, _ = console.ask(path, "POST", origin=origin)
         assert answer.status == 200
         assert silent[0].recv(1) == b""  # the oldest are closed
     refused, _ = console.ask("/wrong/")
@@ -226,17 +237,20 @@ def test_more_pages_than_are_served_are_refused_also_at_once(console: Served) ->
 
 def test_a_damaged_audit_log_is_a_problem_of_the_history_on_the_page(tmp_path: Path) -> None:
     configs = tmp_path / "configs"
+    configs_folder = Path(__file__).parents[3] / "configs"
+    ignore = shutil.ignore_patterns("*.jsonl*", "*.sqlite*")
     shutil.copytree(
-        Path(__file__).parents[3] / "configs",
+        configs_folder,
         configs,
-        ignore=shutil.ignore_patterns("*.jsonl*", "*.sqlite*"),
+        ignore=ignore,
     )
     cell_file = configs / "cells" / "demo.yaml"
     results = Results(cell_file, load_cell(cell_file))
     ledger = ledger_of(cell_file)
     for week in range(2):
         enter(ledger, calibration_of(week))
-    assert results.document()["history"]["problem"] is None
+    history = results.document()["history"]
+    assert history["problem"] is None
     lines = ledger.audit.read_bytes().splitlines(keepends=True)
     ledger.audit.write_bytes(b"".join(lines[1:]))
     shown = results.document()["history"]
@@ -248,7 +262,9 @@ def test_the_gains_of_another_robot_are_a_problem_on_the_page(
     cell: Cell, cell_file: Path, tmp_path: Path
 ) -> None:
     own = calibrated_robot(cell)
-    other = replace(own, drives=(replace(own.drives[0], node_id=99), *own.drives[1:]))
+    changed_drive = replace(own.drives[0], node_id=99)
+    drives = (changed_drive, *own.drives[1:])
+    other = replace(own, drives=drives)
     calibration = tmp_path / "calibration.yaml"
     results = Results(cell_file, cell, calibration)
     save_calibration(replace(demo_calibration(), robot=own), calibration)
@@ -264,7 +280,8 @@ def test_a_file_that_no_reader_expected_does_not_end_the_looking(
     cell: Cell, cell_file: Path
 ) -> None:
     results = Results(cell_file, cell)
-    page = Page(cell, Live(cell_file, cell), results)
+    live = Live(cell_file, cell)
+    page = Page(cell, live, results)
     given: list[Calibration | ValueError] = [ValueError("5 errors for 6 axes"), demo_calibration()]
 
     def calibration() -> tuple[Path, Calibration]:
@@ -296,9 +313,8 @@ def test_a_named_file_that_does_not_exist_is_an_error(
     checkout: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], option: str
 ) -> None:
     missing = tmp_path / "missing.yaml"
-    assert (
-        main(["console", str(checkout / "configs" / "cells" / "demo.yaml"), option, str(missing)])
-        != ExitCode.OK
-    )
+    cells_folder = checkout / "configs" / "cells"
+    demo_path = cells_folder / "demo.yaml"
+    assert main(["console", str(demo_path), option, str(missing)]) != ExitCode.OK
     error = capsys.readouterr().err
     assert all(word in error for word in ("missing.yaml", "found", "expected"))

@@ -78,9 +78,8 @@ class Client:
     def send(self, message: dict[str, Any]) -> None:
         """Send a JSON object, masked by zeros."""
         content = json.dumps(message).encode()
-        self.socket.sendall(
-            struct.pack(">BBH4x", 0x80 | TEXT_FRAME, 0x80 | 126, len(content)) + content
-        )
+        packed = struct.pack(">BBH4x", 0x80 | TEXT_FRAME, 0x80 | 126, len(content))
+        self.socket.sendall(packed + content)
 
     def subscribe(self) -> None:
         """Subscribe to every topic, once all are advertised."""
@@ -99,7 +98,8 @@ class Client:
             if kind == DATA_FRAME and content[0] == MESSAGE_DATA:
                 number, time_ns = struct.unpack_from("<IQ", content, 1)
                 topic = self.topics[number]
-                schema = Schema(number, self.schemas[topic].encode(), "ros2msg", SCHEMAS[topic])
+                encoded_schemas = self.schemas[topic].encode()
+                schema = Schema(number, encoded_schemas, "ros2msg", SCHEMAS[topic])
                 decode = DecoderFactory().decoder_for("cdr", schema)
                 assert decode is not None
                 return topic, time_ns, decode(content[13:])
@@ -167,7 +167,8 @@ def test_a_client_gets_what_the_feed_holds_and_can_change_nothing(
             if isinstance(message, bytes):
                 packet = message
             else:
-                packet = head + json.dumps(message).encode()
+                encoded_text = json.dumps(message).encode()
+                packet = head + encoded_text
             loop.call_soon_threadsafe(live.take, packet)
         loop.call_soon_threadsafe(
             lambda: live.rows.add([[0.1, *range(axes), *range(10, 10 + axes)]])
@@ -198,7 +199,8 @@ def test_a_client_gets_what_the_feed_holds_and_can_change_nothing(
     ((at_ns, predicted),) = found["/cell/predicted"]
     assert at_ns == ORIGIN_NS + 100_000_000
     assert list(predicted.current_a) == list(range(axes))
-    assert list(found["/cell/residual"][0][1].current_a) == list(range(10, 10 + axes))
+    current_a = list(found["/cell/residual"][0][1].current_a)
+    assert current_a == list(range(10, 10 + axes))
     ((_, event_seen),) = found["/cell/events"]
     assert (event_seen.axis, event_seen.kind, event_seen.code, event_seen.text) == (
         2,
@@ -209,14 +211,16 @@ def test_a_client_gets_what_the_feed_holds_and_can_change_nothing(
 
 
 def test_the_shipped_layout_shows_what_the_stream_sends(checkout: Path) -> None:
-    layout = json.loads(
-        (checkout / "configs" / "viewers" / "foxglove.json").read_text(encoding="utf-8")
-    )
-    plotted = {
-        path["value"] for panel in layout["configById"].values() for path in panel.get("paths", ())
-    }
+    viewers_folder = checkout / "configs" / "viewers"
+    foxglove_path = viewers_folder / "foxglove.json"
+    layout = json.loads(foxglove_path.read_text(encoding="utf-8"))
+    plotted = set()
+    for panel in layout["configById"].values():
+        for path in panel.get("paths", ()):
+            plotted.add(path["value"])
     topics = {path.partition(".")[0] for path in plotted}
-    assert topics - set(SCHEMAS) == {"/cell/samples"}  # in logs alone
+    topic_difference = topics - set(SCHEMAS)
+    assert topic_difference == {"/cell/samples"}  # in logs alone
     for topic in (PREDICTED_TOPIC, RESIDUAL_TOPIC):
         assert {f"{topic}.current_a[{axis}]" for axis in range(6)} <= plotted
 
@@ -226,6 +230,8 @@ def test_a_port_that_is_taken_is_a_wrong_command_line(
 ) -> None:
     with socket.create_server(("127.0.0.1", 0)) as other:
         port = str(other.getsockname()[1])
-        cell_file = str(checkout / "configs" / "cells" / "demo.yaml")
+        cells_folder = checkout / "configs" / "cells"
+        cell_file = str(cells_folder / "demo.yaml")
         assert main(["console", cell_file, "--foxglove", port]) == ExitCode.USAGE
-    assert f"--foxglove {port}" in capsys.readouterr().err
+    error_output = capsys.readouterr().err
+    assert f"--foxglove {port}" in error_output

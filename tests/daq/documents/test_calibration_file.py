@@ -53,15 +53,14 @@ def test_every_calibration_comes_back_as_it_was_written(calibration: Calibration
 
 def test_libyaml_writes_what_a_fit_writes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(calibration_file, "_Dumper", None)
-    assert (
-        decode_calibration(encode_calibration(demo_calibration()), "calibration.yaml")
-        == demo_calibration()
-    )
+    content = encode_calibration(demo_calibration())
+    assert decode_calibration(content, "calibration.yaml") == demo_calibration()
 
 
 def test_a_saved_calibration_is_the_only_file_left(path: Path) -> None:
     assert load_calibration(path) == demo_calibration()
-    assert list(path.parent.iterdir()) == [path]
+    files = list(path.parent.iterdir())
+    assert files == [path]
 
 
 @settings(max_examples=60, deadline=None)
@@ -71,7 +70,8 @@ def test_the_document_is_json_without_nan(calibration: Calibration) -> None:
 
 
 def test_the_document_has_what_fit_json_promises() -> None:
-    document = json.loads(json.dumps(as_document(demo_calibration())))
+    text = json.dumps(as_document(demo_calibration()))
+    document = json.loads(text)
     assert {
         "method",
         "gains",
@@ -86,23 +86,22 @@ def test_the_document_has_what_fit_json_promises() -> None:
     assert {"axis", "value", "std_percent", "unit", "nameplate", "change_percent"} <= set(fourth)
     assert fourth["change_percent"] == pytest.approx(100 * (-9.21 / -11.52 - 1))
     assert fourth["std_percent"] == pytest.approx(0.4)
-    assert {"name", "value", "unit", "std_percent"} <= set(document["parameters"][0])
-    assert document["parameters"][1]["std_percent"] is None
-    assert set(document["relative_error_percent"]) == {"axes", "total"}
+    parameter = set(document["parameters"][0])
+    assert {"name", "value", "unit", "std_percent"} <= parameter
+    std_percent = document["parameters"][1]["std_percent"]
+    assert std_percent is None
+    relative_error_percent = set(document["relative_error_percent"])
+    assert relative_error_percent == {"axes", "total"}
 
 
 def test_one_entry_is_on_one_line(path: Path) -> None:
-    assert (
-        len(
-            re.findall(
-                r"^- \{axis: J\d, value: .* "
-                r"change_percent: \S+\}$",
-                path.read_text(),
-                re.MULTILINE,
-            )
-        )
-        == 6
+    matches = re.findall(
+        r"^- \{axis: J\d, value: .* "
+        r"change_percent: \S+\}$",
+        path.read_text(),
+        re.MULTILINE,
     )
+    assert len(matches) == 6
 
 
 @pytest.mark.parametrize(
@@ -179,10 +178,12 @@ def test_a_truncated_file_is_never_taken_for_a_whole_one(path: Path) -> None:
 
 def test_a_number_that_is_not_finite_is_not_saved(path: Path) -> None:
     before = path.read_bytes()
+    calibration = dataclasses.replace(demo_calibration(), condition=float("nan"))
     with pytest.raises(CalibrationUnreadable, match="condition"):
-        save_calibration(dataclasses.replace(demo_calibration(), condition=float("nan")), path)
+        save_calibration(calibration, path)
     assert path.read_bytes() == before
-    assert list(path.parent.iterdir()) == [path]
+    files = list(path.parent.iterdir())
+    assert files == [path]
 
 
 def test_the_exit_codes_distinguish_data_from_refusal() -> None:
@@ -201,11 +202,13 @@ def test_a_failing_disk_leaves_the_old_calibration(
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, call, fail)
+    calibration = dataclasses.replace(demo_calibration(), method="tls")
     with pytest.raises(OSError, match="No space"):
-        save_calibration(dataclasses.replace(demo_calibration(), method="tls"), path)
+        save_calibration(calibration, path)
     monkeypatch.undo()
     assert path.read_bytes() == before
-    assert list(path.parent.iterdir()) == [path]
+    files = list(path.parent.iterdir())
+    assert files == [path]
 
 
 @pytest.mark.parametrize(
@@ -216,7 +219,8 @@ def test_an_impossible_payload_mass_is_refused(key: str, value: Any) -> None:
     calibration = demo_calibration()
     slopes = [gain.value / 4.59 for gain in calibration.gains]
     disc = PayloadMass.of("disc", 4.59, slopes, calibration.gains)
-    content = encode_calibration(dataclasses.replace(calibration, payload_mass=(disc,)))
+    changed_dataclasses = dataclasses.replace(calibration, payload_mass=(disc,))
+    content = encode_calibration(changed_dataclasses)
     assert decode_calibration(content, "calibration.yaml").payload_mass == (disc,)
     impossible = dataclasses.replace(disc, **{key: value})
     content = encode_calibration(dataclasses.replace(calibration, payload_mass=(impossible,)))

@@ -44,10 +44,12 @@ def test_the_ten_lines_of_the_page_read_every_gain_and_parameter(
     assert lines[0] == "J1: 33.9 ± 0.14 Nm/A"
     assert lines[3] == "J4: -9.21 ± 0.037 Nm/A"
     assert lines[-1] == "Ixx2 - 0.5*Iyy2: 3e-05 ± 1e-06 kg m²"
-    assert len(lines) == len(calibration.gains) + len(calibration.parameters)
+    expected = len(calibration.gains) + len(calibration.parameters)
+    assert len(lines) == expected
 
 
 def test_the_page_has_every_key(checkout: Path) -> None:
-    written = set(re.findall(r"`(\w+)`", _page(checkout)))
+    matches = re.findall(r"`(\w+)`", _page(checkout))
+    written = set(matches)
     for entry in (CalibrationDocument, GainEntry, EffectEntry, FullSetEntry, FullParameterEntry):
         assert set(entry.model_fields) <= written, entry.__name__

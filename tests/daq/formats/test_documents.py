@@ -65,7 +65,8 @@ _HOLE = "\0"
 
 
 def _case(text: str, numbers: list[str], keys: list[str], encoding: str = "utf-8") -> _Case:
-    return _Case(tuple(text.split(_HOLE)), tuple(numbers), tuple(keys), encoding)
+    pieces = tuple(text.split(_HOLE))
+    return _Case(pieces, tuple(numbers), tuple(keys), encoding)
 
 
 @st.composite
@@ -76,11 +77,10 @@ def _json_cases(draw: st.DrawFn) -> _Case:
     gap = st.sampled_from(["", " ", "\t", end, end + "    "])
 
     def value(path: tuple[str, ...], depth: int) -> str:
-        kind = draw(
-            st.sampled_from(
-                ["hole", "number", "word", "text", *(["object", "list"] if depth < 3 else [])]
-            )
+        sampled = st.sampled_from(
+            ["hole", "number", "word", "text", *(["object", "list"] if depth < 3 else [])]
         )
+        kind = draw(sampled)
         if kind == "hole" and path:
             numbers.append(draw(_numbers))
             keys.append(".".join(path))
@@ -109,7 +109,8 @@ def _json_cases(draw: st.DrawFn) -> _Case:
         return draw(_numbers)
 
     head = draw(st.sampled_from(["", "\ufeff", " ", end]))
-    return _case(head + value((), 0) + draw(gap), numbers, keys)
+    text = head + value((), 0) + draw(gap)
+    return _case(text, numbers, keys)
 
 
 @st.composite
@@ -117,7 +118,8 @@ def _xml_cases(draw: st.DrawFn) -> _Case:
     numbers: list[str] = []
     keys: list[str] = []
     end = draw(_ends)
-    encoding = draw(st.sampled_from(["utf-8", "utf-8", "iso-8859-1", "windows-1252"]))
+    sampled = st.sampled_from(["utf-8", "utf-8", "iso-8859-1", "windows-1252"])
+    encoding = draw(sampled)
     if encoding == "utf-8":
         names = _words
     else:
@@ -186,9 +188,8 @@ def _dcf_cases(draw: st.DrawFn) -> _Case:
     numbers: list[str] = []
     keys: list[str] = []
     end = draw(_ends)
-    lines = [
-        draw(st.sampled_from(["; Müller, 32.96", "[FileInfo]", "", "[Comments]", "[DeviceInfo]"]))
-    ]
+    sampled = st.sampled_from(["; Müller, 32.96", "[FileInfo]", "", "[Comments]", "[DeviceInfo]"])
+    lines = [draw(sampled)]
     if lines[0].startswith("["):
         lines += ["Lines=1", "Line1=made by hand; 7"]
     objects = draw(
@@ -229,7 +230,8 @@ def _dcf_cases(draw: st.DrawFn) -> _Case:
                 f"{draw(st.sampled_from(['ParameterValue', 'parametervalue']))}{space}={space}{_HOLE}{space}"  # noqa: E501
             )
         lines += draw(st.sampled_from([[], [""], ["PDOMapping=0"], ["Denotation=32.96"]]))
-    return _case(end.join(lines) + draw(st.sampled_from(["", end])), numbers, keys, "iso-8859-1")
+    text = end.join(lines) + draw(st.sampled_from(["", end]))
+    return _case(text, numbers, keys, "iso-8859-1")
 
 
 CASES = {
@@ -244,9 +246,8 @@ def _json_tree(content: bytes) -> object:
 
 
 def _xml_tree(content: bytes) -> object:
-    parser = ElementTree.XMLParser(
-        target=ElementTree.TreeBuilder(insert_comments=True, insert_pis=True)
-    )
+    target = ElementTree.TreeBuilder(insert_comments=True, insert_pis=True)
+    parser = ElementTree.XMLParser(target=target)
     return [
         (e.tag, tuple(sorted(e.attrib.items())), e.text, e.tail)
         for e in ElementTree.fromstring(content, parser).iter()
@@ -264,10 +265,13 @@ def _dcf_tree(content: bytes) -> object:
 @given(data=st.data())
 def test_only_the_numbers_meant_change(kind: ControllerFormat, data: st.DataObject) -> None:
     case = data.draw(CASES[kind])
-    document = decode_document(case.content(case.numbers), "robot", kind)
-    assert document.content == case.content(case.numbers)
+    content = case.content(case.numbers)
+    document = decode_document(content, "robot", kind)
+    expected = case.content(case.numbers)
+    assert document.content == expected
     found = document.locate(case.keys)
-    assert [scalar.text for scalar in found] == list(case.numbers)
+    texts = [scalar.text for scalar in found]
+    assert texts == list(case.numbers)
     spelt = tuple(
         rewrite_gain(
             scalar, gain if scalar.integer is None else abs(round(gain)) + 1, 0.003 * abs(gain)
@@ -309,9 +313,11 @@ def test_another_reader_sees_the_new_numbers_and_nothing_else_new(
     and know nothing of its keys.
     """
     case = data.draw(cases)
-    document = decode_document(case.content(case.numbers), "robot", kind)
+    content = case.content(case.numbers)
+    document = decode_document(content, "robot", kind)
     marks = tuple(str(70000 + i) for i in range(len(case.keys)))
-    changed = document.with_values(dict(zip(case.keys, marks, strict=True)))
+    spelling = dict(zip(case.keys, marks, strict=True))
+    changed = document.with_values(spelling)
     seen = repr(tree(changed.content))
     expected = repr(tree(document.content))
     for mark in marks:
@@ -351,8 +357,9 @@ def test_any_other_difference_is_found(kind: ControllerFormat, data: st.DataObje
 def test_whatever_is_in_the_file_it_is_refused_in_words(
     kind: ControllerFormat, begin: bytes, noise: bytes
 ) -> None:
+    content = begin + noise
     with pytest.raises(ControllerUnfit, match=r"nothing was written|is this the right file"):
-        decode_document(begin + noise, "robot", kind).locate(("6076.nowhere",))
+        decode_document(content, "robot", kind).locate(("6076.nowhere",))
 
 
 def test_a_line_that_goes_on_with_no_value_is_no_dcf() -> None:
@@ -373,7 +380,8 @@ def test_a_line_that_goes_on_with_no_value_is_no_dcf() -> None:
     )
 )
 def test_a_dcf_of_any_lines_is_read_or_refused_in_words(lines: list[str]) -> None:
-    document = decode_document("\n".join(lines).encode(), "a.dcf")
+    content = "\n".join(lines).encode()
+    document = decode_document(content, "a.dcf")
     with suppress(ControllerUnfit):
         document.readings()
 
@@ -462,10 +470,8 @@ def test_xml_that_is_not_safe_or_none_is_refused(content: bytes, says: str) -> N
 
 def test_deep_and_wide_xml_takes_no_recursion() -> None:
     deep = b"<R><G>1.5</G>" + b"<a>" * 20_000 + b"</a>" * 20_000 + b"<b/>" * 20_000 + b"</R>"
-    assert (
-        b"<G>2.5000</G>"
-        in decode_document(deep, "robot.xml").with_values({"R/G": "2.5000"}).content
-    )
+    content = decode_document(deep, "robot.xml").with_values({"R/G": "2.5000"}).content
+    assert b"<G>2.5000</G>" in content
 
 
 _DCF = """\
@@ -614,10 +620,10 @@ CompactSubObj=2
 
 def test_an_element_of_an_array_in_compact_storage_is_changed_in_its_list_of_values() -> None:
     document = DcfDocument("drive.dcf", _COMPACT)
-    assert [scalar.value for scalar in document.locate(("2003:01", "2003sub3"))] == [1.5, 32.5]
-    assert document.with_values({"2003:03": "33.0000"}).text == _COMPACT.replace(
-        "3=32.5", "3=33.0000"
-    )
+    scalars = [scalar.value for scalar in document.locate(("2003:01", "2003sub3"))]
+    assert scalars == [1.5, 32.5]
+    text = document.with_values({"2003:03": "33.0000"}).text
+    assert text == _COMPACT.replace("3=32.5", "3=33.0000")
 
 
 @pytest.mark.parametrize(
@@ -636,8 +642,9 @@ def test_an_element_in_compact_storage_that_has_no_value_is_refused(key: str, sa
 
 
 def test_two_lists_of_values_of_one_array_are_refused() -> None:
+    dcf_document = DcfDocument("drive.dcf", _COMPACT + "[2003value]\n1=2.5\n")
     with pytest.raises(ControllerUnfit, match=r"\[2003Value\] 2 times, on lines 9 and 17"):
-        DcfDocument("drive.dcf", _COMPACT + "[2003value]\n1=2.5\n").locate(("2003:01",))
+        dcf_document.locate(("2003:01",))
 
 
 @pytest.mark.parametrize("value", ["$NODEID+0x10", "0x10+$NODEID", "$NodeId + 16"])
@@ -660,7 +667,8 @@ def test_a_type_is_decimal_or_hexadecimal_digits(entry: str, number: str) -> Non
     )
     with pytest.raises(ControllerUnfit) as caught:
         DcfDocument("drive.dcf", text).locate(("2003",))
-    line = text.splitlines().index(f"{entry}={number}") + 1
+    column = f"{entry}={number}"
+    line = text.splitlines().index(column) + 1
     assert (f"line {line}: '{number}'; expected {entry.lower()} in decimal digits") in str(
         caught.value
     )
@@ -668,9 +676,8 @@ def test_a_type_is_decimal_or_hexadecimal_digits(entry: str, number: str) -> Non
 
 @pytest.mark.parametrize("kind", ["0x0008", "0X8", "8", "0x00000008", "0x11", "17"])
 def test_a_type_may_be_written_in_each_way_that_cia_306_knows(kind: str) -> None:
-    (scalar,) = DcfDocument("drive.dcf", f"[2003]\nDataType={kind}\nParameterValue=1.5\n").locate(
-        ("2003",)
-    )
+    dcf_document = DcfDocument("drive.dcf", f"[2003]\nDataType={kind}\nParameterValue=1.5\n")
+    (scalar,) = dcf_document.locate(("2003",))
     assert scalar.value == 1.5
 
 
@@ -678,10 +685,9 @@ def test_a_type_may_be_written_in_each_way_that_cia_306_knows(kind: str) -> None
 @pytest.mark.parametrize("kind", ["0x0004", "0x0008", "0x0011"])
 def test_a_number_of_a_dcf_that_begins_with_zero_is_not_guessed(kind: str, number: str) -> None:
     """10 to a reader of decimals, 8 to one of CiA 306."""
+    dcf_document = DcfDocument("drive.dcf", f"[2003]\nDataType={kind}\nParameterValue={number}\n")
     with pytest.raises(ControllerUnfit) as caught:
-        DcfDocument("drive.dcf", f"[2003]\nDataType={kind}\nParameterValue={number}\n").locate(
-            ("2003",)
-        )
+        dcf_document.locate(("2003",))
     assert f"line 3: '{number}'" in str(caught.value)
     assert "octal" in str(caught.value)
     assert "nothing was written" in str(caught.value)
@@ -691,25 +697,26 @@ def test_a_number_of_a_dcf_that_begins_with_zero_is_not_guessed(kind: str, numbe
     ("number", "value"), [("0", 0.0), ("0.10", 0.1), ("010.5", 10.5), ("-0.0", 0.0), ("10", 10.0)]
 )
 def test_a_real_of_a_dcf_with_a_point_is_no_octal_number(number: str, value: float) -> None:
-    (scalar,) = DcfDocument("drive.dcf", f"[2003]\nDataType=8\nParameterValue={number}\n").locate(
-        ("2003",)
-    )
+    dcf_document = DcfDocument("drive.dcf", f"[2003]\nDataType=8\nParameterValue={number}\n")
+    (scalar,) = dcf_document.locate(("2003",))
     assert scalar.value == value
 
 
 def test_a_number_of_xml_that_begins_with_zero_is_decimal() -> None:
     """As xs:double says."""
-    (scalar,) = XmlDocument("robot", "<R><G>010</G></R>", "utf-8").locate(("R/G",))
+    xml_document = XmlDocument("robot", "<R><G>010</G></R>", "utf-8")
+    (scalar,) = xml_document.locate(("R/G",))
     assert scalar.value == 10.0
 
 
 @pytest.mark.parametrize("key", ["200D:0A", "200dsubA", "0x200Dsub0a"])
 def test_an_object_is_its_index_and_subindex_however_its_section_spells_them(key: str) -> None:
     changed = DcfDocument("drive.dcf", _DCF).with_values({key: "2.5000"})
-    assert changed.text == _DCF.replace(
+    expected = _DCF.replace(
         "[200Dsub0A]\nDataType=0x0008\nParameterValue=1.5",
         "[200Dsub0A]\nDataType=0x0008\nParameterValue=2.5000",
     )
+    assert changed.text == expected
 
 
 @pytest.mark.parametrize(
@@ -729,8 +736,10 @@ def test_an_integer_keeps_its_style_and_another_unit_its_factor(
     (scalar,) = document.locate((key,))
     reported = rewrite_gain(scalar, gain, std, factor)
     assert reported.spelling == spelling
-    assert abs(reported.new - gain) <= std
-    assert reported.current_gain == scalar.value / factor
+    difference = reported.new - gain
+    assert abs(difference) <= std
+    expected = scalar.value / factor
+    assert reported.current_gain == expected
     (read,) = document.with_values({key: spelling}).locate((key,))
     assert read.value / factor == reported.new
 
@@ -751,7 +760,8 @@ def test_an_integer_that_does_not_report_the_gain_is_refused(
 ) -> None:
     (scalar,) = DcfDocument("drive.dcf", _DCF).locate((key,))
     if says == "0.4":
-        assert rewrite_gain(scalar, gain, std, factor).spelling == "400"
+        spelling = rewrite_gain(scalar, gain, std, factor).spelling
+        assert spelling == "400"
         return
     with pytest.raises(ControllerUnfit) as caught:
         rewrite_gain(scalar, gain, std, factor)
@@ -760,7 +770,8 @@ def test_an_integer_that_does_not_report_the_gain_is_refused(
 
 def test_the_same_number_stays_as_the_human_wrote_it() -> None:
     (hexadecimal,) = DcfDocument("drive.dcf", _DCF).locate(("6076",))
-    assert rewrite_gain(hexadecimal, 1.5, 0.01, 1000.0).spelling == "0x5DC"
+    spelling = rewrite_gain(hexadecimal, 1.5, 0.01, 1000.0).spelling
+    assert spelling == "0x5DC"
     (decimal,) = JsonDocument("robot", '{"a": 32960}').locate(("a",))
     assert rewrite_gain(decimal, 32.96, 0.01, 1000.0).spelling == "32960"
     assert rewrite_gain(decimal, 32.97, 0.01, 1000.0) != rewrite_gain(decimal, 32.96, 0.01, 1000.0)
@@ -778,13 +789,16 @@ def test_a_real_device_configuration_changes_in_one_number_alone(
     (scalar,) = document.locate((heartbeat,))
     changed = document.with_values({heartbeat: "123"}).content
     cut = (scalar.start, scalar.end)
-    assert changed == content[: cut[0]] + b"123" + content[cut[1] :]
-    assert content[cut[0] : cut[1]].decode() == scalar.text
+    expected = content[: cut[0]] + b"123" + content[cut[1] :]
+    assert changed == expected
+    decoded_content = content[cut[0] : cut[1]].decode()
+    assert decoded_content == scalar.text
 
 
 @pytest.mark.parametrize("name", ["maxon_epos4.eds", "ros2_canopen_cia402_slave.eds"])
 def test_a_real_data_sheet_has_no_value_to_change(shared_data: Path, name: str) -> None:
-    document = decode_document((shared_data / "eds" / name).read_bytes(), name)
+    content = (shared_data / "eds" / name).read_bytes()
+    document = decode_document(content, name)
     with pytest.raises(ControllerUnfit, match="without ParameterValue"):
         document.locate(("1017",))
 
@@ -808,7 +822,9 @@ def test_the_name_gives_the_format(name: str, kind: ControllerFormat) -> None:
 
 def test_every_format_has_a_reader_and_suffixes_of_its_own() -> None:
     assert set(FORMATS) == set(ControllerFormat)
-    suffixes = [suffix for _, of_format in FORMATS.values() for suffix in of_format]
+    suffixes = []
+    for _, of_format in FORMATS.values():
+        suffixes.extend(of_format)
     assert len(suffixes) == len(set(suffixes))
     assert all(of_format for _, of_format in FORMATS.values())
 
@@ -890,7 +906,8 @@ def test_keys_of_the_file_may_have_dots(name: str, text: str) -> None:
     document = decode_document(text.encode(), name)
     keys = ("node.ros__parameters.gains.J1.nm_per_a", "node.ros__parameters.gains.J2.nm_per_a")
     assert [one.value for one in document.locate(keys)] == [32.96, -11.52]
-    assert document.with_values({keys[0]: "33.10"}).text == text.replace("32.96", "33.10")
+    spelling = {keys[0]: "33.10"}
+    assert document.with_values(spelling).text == text.replace("32.96", "33.10")
 
 
 @pytest.mark.parametrize(

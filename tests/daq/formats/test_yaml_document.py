@@ -29,16 +29,20 @@ def test_only_theNUMBERS_meant_change(case: Case, data: st.DataObject) -> None:
             max_size=len(case.keys),
         )
     )
-    file = decode_document(case.text(case.numbers).encode(), "robot.yaml")
+    content = case.text(case.numbers).encode()
+    file = decode_document(content, "robot.yaml")
     found = file.locate(case.keys)
-    assert [scalar.text for scalar in found] == list(case.numbers)
-    assert [scalar.value for scalar in found] == [float(number) for number in case.numbers]
+    texts = [scalar.text for scalar in found]
+    assert texts == list(case.numbers)
+    expected = [float(number) for number in case.numbers]
+    assert [scalar.value for scalar in found] == expected
 
     spelt = tuple(
         spell(gain, 0.003 * abs(gain), number)
         for gain, number in zip(gains, case.numbers, strict=True)
     )
-    changed = file.with_values(dict(zip(case.keys, spelt, strict=True)))
+    spelling = dict(zip(case.keys, spelt, strict=True))
+    changed = file.with_values(spelling)
 
     assert changed.text == case.text(spelt)
     assert [scalar.text for scalar in changed.locate(case.keys)] == list(spelt)
@@ -142,7 +146,8 @@ def test_a_number_that_cannot_be_changed_alone_is_refused(text: str, key: str, s
 )
 def test_what_is_written_for_a_tagged_number_is_a_number_to_both_readers(text: str) -> None:
     (scalar,) = YamlDocument("robot.yaml", text).locate(("g",))
-    changed = YamlDocument("robot.yaml", text).with_values({"g": scalar.spell(7.7, 0.1)}).text
+    spelling = {"g": scalar.spell(7.7, 0.1)}
+    changed = YamlDocument("robot.yaml", text).with_values(spelling).text
     for tree in (yaml.safe_load(changed), YAML(typ="safe", pure=True).load(changed)):
         assert float(tree["g"]) == 7.7
 
@@ -191,9 +196,11 @@ def test_tabs_behind_a_number_are_read_and_stay(gap: str, behind: str) -> None:
 def test_tabs_between_a_key_and_its_number_are_read_and_stay(gap: str) -> None:
     text = f"J1:\n  gain:{gap}32.96\nJ2: {{gain:{gap}-11.52}}\n"
     document = decode_document(text.encode(), "robot.yaml")
-    assert [scalar.value for scalar in document.locate(("J1.gain", "J2.gain"))] == [32.96, -11.52]
+    scalars = [scalar.value for scalar in document.locate(("J1.gain", "J2.gain"))]
+    assert scalars == [32.96, -11.52]
     changed = document.with_values({"J1.gain": "33.5000"})
-    assert changed.content == text.replace("32.96", "33.5000").encode()
+    expected = text.replace("32.96", "33.5000").encode()
+    assert changed.content == expected
 
 
 def test_a_tab_that_indents_is_still_no_yaml() -> None:

@@ -62,8 +62,10 @@ def _variance(blocks: BlocksSoFar) -> float:
 
 def _with_one_more(blocks: BlocksSoFar, role: BlockRole) -> BlocksSoFar:
     if role is BlockRole.BARE:
-        return replace(blocks, bare=blocks.bare + 1, is_mounted=False)
-    return replace(blocks, loaded=blocks.loaded + 1, is_mounted=True)
+        bare = blocks.bare + 1
+        return replace(blocks, bare=bare, is_mounted=False)
+    loaded = blocks.loaded + 1
+    return replace(blocks, loaded=loaded, is_mounted=True)
 
 
 def _recorded(first_ratio: float) -> list[BlocksSoFar]:
@@ -71,9 +73,13 @@ def _recorded(first_ratio: float) -> list[BlocksSoFar]:
     target = _variance(AFTER_THREE) / first_ratio
     steps = [AFTER_THREE]
     while _variance(steps[-1]) > target * (1.0 + ROUNDING):
-        way = quickest_way(steps[-1], _variance(steps[-1]) / target, BLOCK_S)
-        role = next_role(steps[-1], way)
-        steps.append(_with_one_more(steps[-1], role))
+        last_step = steps[-1]
+        variance_ratio = _variance(last_step) / target
+        way = quickest_way(steps[-1], variance_ratio, BLOCK_S)
+        so_far = steps[-1]
+        role = next_role(so_far, way)
+        blocks = steps[-1]
+        steps.append(_with_one_more(blocks, role))
     return steps
 
 
@@ -119,9 +125,11 @@ def test_it_is_quicker_than_the_order_that_cancels_drift(ratio: float) -> None:
     target = _variance(AFTER_THREE) / ratio
     steps = [AFTER_THREE]
     for number in count(len(FIRST_BLOCKS)):
-        if _variance(steps[-1]) <= target:
+        blocks = steps[-1]
+        if _variance(blocks) <= target:
             break
-        steps.append(_with_one_more(steps[-1], fixed_role(number)))
+        last_step = steps[-1]
+        steps.append(_with_one_more(last_step, fixed_role(number)))
     assert _time_s(_recorded(ratio)) < 0.8 * _time_s(steps)
 
 
@@ -132,12 +140,15 @@ def _until_limit(first_ratio: float, blocks: int, *, is_fixed: bool) -> tuple[fl
     target = _variance(AFTER_THREE) / first_ratio
     steps = [AFTER_THREE]
     for number in range(blocks):
-        ratio = _variance(steps[-1]) / target
+        last_step = steps[-1]
+        ratio = _variance(last_step) / target
         if ratio <= 1.0 + ROUNDING:
             break
-        role = fixed_role(len(FIRST_BLOCKS) + number)
+        block_number = len(FIRST_BLOCKS) + number
+        role = fixed_role(block_number)
         if not is_fixed:
-            role = next_role(steps[-1], quickest_way(steps[-1], ratio, BLOCK_S, blocks - number))
+            so_far = steps[-1]
+            role = next_role(so_far, quickest_way(steps[-1], ratio, BLOCK_S, blocks - number))
         steps.append(_with_one_more(steps[-1], role))
     changes = sum(one.is_mounted != other.is_mounted for one, other in pairwise(steps))
     return _variance(steps[-1]) / target, changes
@@ -158,7 +169,8 @@ def test_what_is_left_shrinks_by_each_block(first_ratio: float) -> None:
     steps = _recorded(first_ratio)
     target = _variance(AFTER_THREE) / first_ratio
     left = [quickest_way(one, _variance(one) / target, BLOCK_S).count for one in steps[:-1]]
-    assert left == list(range(len(steps) - 1, 0, -1))
+    expected = list(range(len(steps) - 1, 0, -1))
+    assert left == expected
 
 
 NO_LIMIT = 1000  #: Blocks
@@ -169,11 +181,13 @@ def test_where_the_prediction_is_right_the_payload_is_mounted_once(ratio: float)
     """σ² of n bare and n loaded blocks is that of one of each over n."""
     roles = first_blocks(bare_blocks_first(ratio, NO_LIMIT))
     bare = roles.count(BlockRole.BARE)
-    assert bare == max(1, ceil(ratio - ROUNDING))
+    expected = max(1, ceil(ratio - ROUNDING))
+    assert bare == expected
     so_far = BlocksSoFar(bare=bare, loaded=1, is_mounted=True)
     target = 2.0 / ratio
     while _variance(so_far) > target * (1.0 + ROUNDING):
-        way = quickest_way(so_far, _variance(so_far) / target, BLOCK_S)
+        variance_ratio = _variance(so_far) / target
+        way = quickest_way(so_far, variance_ratio, BLOCK_S)
         role = next_role(so_far, way)
         assert role is BlockRole.LOADED
         so_far = _with_one_more(so_far, role)

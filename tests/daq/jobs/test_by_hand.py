@@ -38,11 +38,13 @@ def record_by_hand(rig: Rig, plan: Path, *options: str) -> int:
 def test_the_policy_for_jobs_moves_no_axis_for_a_person(
     tmp_path: Path, one_move: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    rig = make_rig(tmp_path / "cell", one_move, policy={"motion": "allowed"})
+    folder = tmp_path / "cell"
+    rig = make_rig(folder, one_move, policy={"motion": "allowed"})
     with serving(rig) as cell:
         assert record_by_hand(rig, one_move) == ExitCode.USAGE
         assert unmoved(cell)
-    failure = json.loads(capsys.readouterr().err.splitlines()[-1])
+    lines = capsys.readouterr().err.splitlines()
+    failure = json.loads(lines[-1])
     assert failure["kind"] == "MotionRefused"
     assert failure["do"] == "pass --enable-motion"
     assert not list(rig.folder.glob("*.mcap*"))
@@ -52,12 +54,14 @@ def test_the_policy_for_jobs_moves_no_axis_for_a_person(
 def test_an_interlock_that_says_no_holds_a_person_too(
     tmp_path: Path, one_move: Path, motion: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    rig = make_rig(tmp_path / "cell", one_move, policy={"motion": motion})
+    folder = tmp_path / "cell"
+    rig = make_rig(folder, one_move, policy={"motion": motion})
     rig.closed.unlink()
     with serving(rig) as cell:
         assert record_by_hand(rig, one_move, "--enable-motion") == ExitCode.NOT_RELEASED
         assert cell.cycles == 0
-        failure = json.loads(capsys.readouterr().err.splitlines()[-1])
+        lines = capsys.readouterr().err.splitlines()
+        failure = json.loads(lines[-1])
         assert (failure["kind"], failure["exit_code"]) == ("NotReleased", ExitCode.NOT_RELEASED)
         assert "start again" in failure["do"]
         assert not list(rig.folder.glob("*.mcap*"))
@@ -69,7 +73,8 @@ def test_a_program_that_records_is_held_by_a_door_that_opens_before_power(
     tmp_path: Path, one_move: Path
 ) -> None:
     """The library has the same guard as the command: the drives were prepared, and get no power."""
-    rig = make_rig(tmp_path / "cell", one_move, interlock=CLOSED_ONCE)
+    folder = tmp_path / "cell"
+    rig = make_rig(folder, one_move, interlock=CLOSED_ONCE)
     out = rig.folder / "a.mcap"
     plan = load_plan(one_move, rig.cell)
     request = RecordingRequest(

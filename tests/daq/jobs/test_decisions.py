@@ -36,12 +36,14 @@ def test_a_job_that_writes_makes_its_certificate_once_more(tmp_path: Path, made:
     """The first one is made before the decision;
     what stays must not say that the gains are still to be written.
     """
-    rig = made_rig(tmp_path / "cell", made)
+    folder = tmp_path / "cell"
+    rig = made_rig(folder, made)
     tools = rig.tools
     before: list[str] = []
 
     def ends_first(*_: object) -> Any:
-        before.append((rig.session.folder / "report" / "report.html").read_text())
+        report_folder = rig.session.folder / "report"
+        before.append((report_folder / "report.html").read_text())
         raise KeyboardInterrupt
 
     rig.tools = replace(tools, certify=ends_first)
@@ -51,33 +53,42 @@ def test_a_job_that_writes_makes_its_certificate_once_more(tmp_path: Path, made:
     rig.tools = tools
     rig.clock.go_on(minutes=5)
     assert rig.job().outcome is Outcome.APPLIED
-    page = (rig.session.folder / "report" / "report.html").read_text()
+    report_path = rig.session.folder / "report" / "report.html"
+    page = report_path.read_text()
     assert "written on 2026-01-05" not in before[0]
     assert "written on 2026-01-05" in page
-    assert [entry.action for entry in rig.audit].count(AuditAction.APPLIED) == 1
-    assert (rig.session.state.attempt, rig.session.finished) == (2, True)
+    actions = [entry.action for entry in rig.audit]
+    assert actions.count(AuditAction.APPLIED) == 1
+    attempt = rig.session.state.attempt
+    assert (attempt, rig.session.finished) == (2, True)
 
 
 def test_a_change_waits_for_a_person_who_applies_it_with_the_command_that_was_shown(
     tmp_path: Path, made: Made, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    rig = made_rig(tmp_path / "cell", made, policy=NEEDS_PERSON)
+    folder = tmp_path / "cell"
+    rig = made_rig(folder, made, policy=NEEDS_PERSON)
     before = rig.controller.read_bytes()
     ended = rig.job()
-    assert (ended.outcome, ended.exit_code) == (Outcome.PROPOSED, ExitCode.PROPOSED)
+    expected = (Outcome.PROPOSED, ExitCode.PROPOSED)
+    assert (ended.outcome, ended.exit_code) == expected
     assert rig.controller.read_bytes() == before
-    assert [entry.action for entry in rig.audit][1:] == [
+    actions = [entry.action for entry in rig.audit]
+    assert actions[1:] == [
         AuditAction.CALIBRATION_ENTERED,
         AuditAction.PROPOSED,
         AuditAction.RECALIBRATION_ENDED,
     ]
-    assert "+    gain: -9." in (rig.session.folder / "proposal.diff").read_text()
-    *_, command = json.loads((rig.session.folder / "summary.json").read_text())["to_do"]
+    proposal_path = rig.session.folder / "proposal.diff"
+    assert "+    gain: -9." in proposal_path.read_text()
+    text = (rig.session.folder / "summary.json").read_text()
+    *_, command = json.loads(text)["to_do"]
     assert main(command.split()[1:]) == ExitCode.OK
     capsys.readouterr()
     assert rig.controller.read_bytes() != before
     in_force = history_of(rig.cell_file).in_force(str(rig.controller))
-    assert in_force == rig.audit[2].details["calibration_sha256"]
+    calibration_sha256 = rig.audit[2].details["calibration_sha256"]
+    assert in_force == calibration_sha256
     # The next week nothing is new: the σ of what the person applied is known from the history.
     rig.clock.go_on(days=7)
     assert rig.job().outcome is Outcome.UNCHANGED
@@ -88,29 +99,34 @@ def test_a_change_waits_for_a_person_who_applies_it_with_the_command_that_was_sh
 
 def test_a_failed_check_refuses_and_the_next_job_records_anew(tmp_path: Path, made: Made) -> None:
     strict = {"motion": "allowed", "apply": {"by": "job", "max_std_percent": 0.01}}
-    rig = made_rig(tmp_path / "cell", made, policy=strict)
+    folder = tmp_path / "cell"
+    rig = made_rig(folder, made, policy=strict)
     before = rig.controller.read_bytes()
     for number in (1, 2):
         with pytest.raises(CalibrationRefused, match="σ"):
             rig.job()
         rig.clock.go_on(hours=1)
         assert len(rig.sessions) == number
-        assert rig.sessions[-1].state.outcome is Outcome.REFUSED
-        assert rig.sessions[-1].state.exit_code == ExitCode.CALIBRATION_REFUSED
+        last_session = rig.sessions[-1]
+        assert last_session.state.outcome is Outcome.REFUSED
+        state = rig.sessions[-1].state
+        assert state.exit_code == ExitCode.CALIBRATION_REFUSED
     assert rig.controller.read_bytes() == before
     actions = [entry.action for entry in rig.audit]
-    assert actions[:4] == [
+    expected = [
         AuditAction.RECALIBRATION_BEGUN,
         AuditAction.CALIBRATION_ENTERED,
         AuditAction.REFUSED,
         AuditAction.RECALIBRATION_ENDED,
     ]
+    assert actions[:4] == expected
 
 
 def test_recordings_that_contradict_the_model_are_not_fitted_twice(
     tmp_path: Path, made: Made
 ) -> None:
-    rig = made_rig(tmp_path / "cell", made)
+    folder = tmp_path / "cell"
+    rig = made_rig(folder, made)
     known = rig.tools
 
     def contradicted(*_: Any, **__: Any) -> Any:
@@ -119,10 +135,9 @@ def test_recordings_that_contradict_the_model_are_not_fitted_twice(
     rig.tools = replace(known, fit=contradicted)
     with pytest.raises(ModelContradicted):
         rig.job()
-    assert (rig.session.state.outcome, rig.session.state.exit_code) == (
-        Outcome.UNFIT,
-        ExitCode.DATA_UNFIT,
-    )
+    expected = (Outcome.UNFIT, ExitCode.DATA_UNFIT)
+    outcome = rig.session.state.outcome
+    assert (outcome, rig.session.state.exit_code) == expected
     rig.tools = known
     assert rig.job().outcome is Outcome.APPLIED
     assert len(rig.sessions) == 2
@@ -132,7 +147,8 @@ def test_a_timer_over_many_weeks(tmp_path: Path, made: Made) -> None:
     """The job once a day at three, due once a week:
     it acts where something has changed, and only there.
     """
-    rig = made_rig(tmp_path / "cell", made, policy=BY_THE_JOB, every_h=160, keep_sessions=4)
+    folder = tmp_path / "cell"
+    rig = made_rig(folder, made, policy=BY_THE_JOB, every_h=160, keep_sessions=4)
     days = 7 * 8
     outcomes: list[tuple[int, str]] = []
     for day in range(days):
@@ -152,7 +168,7 @@ def test_a_timer_over_many_weeks(tmp_path: Path, made: Made) -> None:
         if outcome != "not due":
             outcomes.append((day, outcome))
         rig.clock.go_on(days=1, seconds=-rig.clock.at.timestamp() % 60)
-    assert outcomes == [
+    expected = [
         (0, "applied"),
         (7, "unchanged"),
         (14, "DriveFault"),
@@ -165,13 +181,15 @@ def test_a_timer_over_many_weeks(tmp_path: Path, made: Made) -> None:
         (44, "unchanged"),
         (51, "unchanged"),
     ]
+    assert outcomes == expected
     decision = rig.sessions[-1].state.decision
     assert decision is not None
     assert not any(gain.differs for gain in decision.gains)
     # The last four, and the one whose gains are in force: its logs are what the controller rests
     # on.
     assert len(rig.sessions) == 5
-    assert rig.sessions[0].state.outcome is Outcome.APPLIED
+    state = rig.sessions[0].state
+    assert state.outcome is Outcome.APPLIED
     fitted = rig.sessions[0].state.fitted
     assert fitted is not None
     assert history_of(rig.cell_file).in_force() == fitted.calibration_sha256
@@ -189,7 +207,8 @@ def test_a_write_that_the_history_does_not_contain_is_known_by_its_numbers(
     """Their writer was killed right after the write:
     taken for exact, they would differ from each new one too often.
     """
-    rig = made_rig(tmp_path / "cell", made, policy=BY_THE_JOB, every_h=160)
+    folder = tmp_path / "cell"
+    rig = made_rig(folder, made, policy=BY_THE_JOB, every_h=160)
     assert rig.job().outcome is Outcome.APPLIED
     _forget_the_write(rig)
     assert history_of(rig.cell_file).events == ()
@@ -203,41 +222,50 @@ def test_a_write_that_the_history_does_not_contain_is_known_by_its_numbers(
 def test_a_drift_is_reported_although_the_job_applies_it_in_slices(
     tmp_path: Path, made: Made
 ) -> None:
-    rig = made_rig(tmp_path / "cell", made, policy=BY_THE_JOB, every_h=160)
+    folder = tmp_path / "cell"
+    rig = made_rig(folder, made, policy=BY_THE_JOB, every_h=160)
     for week in range(12):
         rig.tools = made.tools(rig, J4=0.98**week)
-        assert rig.job().outcome in (Outcome.APPLIED, Outcome.UNCHANGED)
-        alarms = {gain.axis: gain.alarm for gain in rig.sessions[-1].state.watched}
+        outcome = rig.job().outcome
+        assert outcome in (Outcome.APPLIED, Outcome.UNCHANGED)
+        watched = rig.sessions[-1].state.watched
+        alarms = {gain.axis: gain.alarm for gain in watched}
         if any(alarms.values()):
             break
         rig.clock.go_on(days=7)
     assert [axis for axis, alarm in alarms.items() if alarm] == ["J4"]
     warned = [event for event in rig.events if event["event"] == "drift"]
-    assert [(event["level"], event["axis"], event["text"]) for event in warned] == [
-        ("warning", "J4", alarms["J4"])
-    ]
-    assert alarms["J4"] in (rig.sessions[-1].folder / "summary.txt").read_text()
+    expected = [("warning", "J4", alarms["J4"])]
+    assert [(event["level"], event["axis"], event["text"]) for event in warned] == expected
+    last_session = rig.sessions[-1]
+    summary_path = last_session.folder / "summary.txt"
+    assert alarms["J4"] in summary_path.read_text()
     metrics = (rig.cells / "drivegain_demo.prom").read_text()
     reported = [f'drift_alarm{{axis="J{n}",cell="demo"}} {float(n == 4)}' for n in range(1, 7)]
-    assert [line for line in reported if line not in metrics] == []
+    lines = [line for line in reported if line not in metrics]
+    assert lines == []
 
 
 def test_nothing_is_removed_while_no_one_knows_what_is_in_force(tmp_path: Path, made: Made) -> None:
-    rig = made_rig(tmp_path / "cell", made, policy=BY_THE_JOB, every_h=160, keep_sessions=1)
+    folder = tmp_path / "cell"
+    rig = made_rig(folder, made, policy=BY_THE_JOB, every_h=160, keep_sessions=1)
     for outcome in (Outcome.APPLIED, Outcome.UNCHANGED):
         assert rig.job().outcome is outcome
         rig.clock.go_on(days=7)
-    (rig.cells / "demo.history.sqlite").write_bytes(b"no database at all" * 100)
+    demo_path = rig.cells / "demo.history.sqlite"
+    demo_path.write_bytes(b"no database at all" * 100)
     with pytest.raises(HistoryUnreadable):
         rig.job()
     assert len(rig.sessions) == 3
-    assert "no old session removed" in {event["event"] for event in rig.events}
+    events = {event["event"] for event in rig.events}
+    assert "no old session removed" in events
 
 
 def test_a_job_says_that_its_history_may_lack_something_and_removes_nothing(
     tmp_path: Path, made: Made
 ) -> None:
-    rig = made_rig(tmp_path / "cell", made, policy=BY_THE_JOB, every_h=160, keep_sessions=1)
+    folder = tmp_path / "cell"
+    rig = made_rig(folder, made, policy=BY_THE_JOB, every_h=160, keep_sessions=1)
     assert rig.job().outcome is Outcome.APPLIED
     rig.clock.go_on(days=7)
     audit = rig.cells / "demo.audit.jsonl"
@@ -252,30 +280,35 @@ def test_a_job_says_that_its_history_may_lack_something_and_removes_nothing(
 def test_what_is_written_stays_reported_as_written_whatever_becomes_of_the_history(
     tmp_path: Path, made: Made
 ) -> None:
-    rig = made_rig(tmp_path / "cell", made, policy=BY_THE_JOB)
+    folder = tmp_path / "cell"
+    rig = made_rig(folder, made, policy=BY_THE_JOB)
     apply = rig.tools.apply
 
     def breaks_the_history(*given: Any, **further: Any) -> Any:
-        (rig.cells / "demo.history.sqlite").write_bytes(b"no database at all" * 100)
+        demo_path = rig.cells / "demo.history.sqlite"
+        demo_path.write_bytes(b"no database at all" * 100)
         return apply(*given, **further)
 
     rig.tools = replace(rig.tools, apply=breaks_the_history)
     before = rig.controller.read_bytes()
     assert rig.job().outcome is Outcome.APPLIED
     assert rig.controller.read_bytes() != before
-    assert "the history may lack this write; the next job, apply or history --add enters it" in {
-        event["event"] for event in rig.events
-    }
-    assert "drivegain rollback" in " ".join(
-        json.loads((rig.session.folder / "summary.json").read_text())["to_do"]
+    events = {event["event"] for event in rig.events}
+    assert (
+        "the history may lack this write; the next job, apply or history --add enters it" in events
     )
+    summary_path = rig.session.folder / "summary.json"
+    document = json.loads(summary_path.read_text())
+    assert "drivegain rollback" in " ".join(document["to_do"])
 
 
 def test_a_history_that_cannot_be_read_is_reported_before_anything_moves(
     tmp_path: Path, made: Made
 ) -> None:
-    rig = made_rig(tmp_path / "cell", made)
-    (rig.cells / "demo.history.sqlite").write_bytes(b"no database at all" * 100)
+    folder = tmp_path / "cell"
+    rig = made_rig(folder, made)
+    demo_path = rig.cells / "demo.history.sqlite"
+    demo_path.write_bytes(b"no database at all" * 100)
     with pytest.raises(HistoryUnreadable):
         rig.job()
     assert rig.session.state.runs == ()
@@ -292,12 +325,16 @@ def test_a_calibration_that_a_second_person_must_sign_says_so_in_what_is_to_do(
         "signatures": 1,
         "signers": {"bob": public},
     }
-    rig = made_rig(tmp_path / "cell", made, policy={**NEEDS_PERSON, "apply": signed})
+    folder = tmp_path / "cell"
+    policy = {**NEEDS_PERSON, "apply": signed}
+    rig = made_rig(folder, made, policy=policy)
     assert rig.job().outcome is Outcome.PROPOSED
-    sign, _, _, apply = json.loads((rig.session.folder / "summary.json").read_text())["to_do"]
+    text = (rig.session.folder / "summary.json").read_text()
+    sign, _, _, apply = json.loads(text)["to_do"]
     assert main(apply.split()[1:]) == ExitCode.CALIBRATION_REFUSED
     options = sign.partition("drivegain ")[2].replace("KEY", str(tmp_path / "bob.key"))
-    assert main(options.replace("NAME", "bob").split()) == ExitCode.OK
+    changed_options = options.replace("NAME", "bob")
+    assert main(changed_options.split()) == ExitCode.OK
     assert main(apply.split()[1:]) == ExitCode.OK
     capsys.readouterr()
 

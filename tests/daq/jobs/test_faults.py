@@ -68,15 +68,19 @@ def fails(rig: Rig, cell: SimulatedCell, kind: type[Exception]) -> Exception:
     assert rig.controller.read_bytes() == before
     assert rig.backups == []
     assert (session.state.outcome, session.state.exit_code) == (Outcome.STOPPED, code)
-    assert [entry.action for entry in rig.audit] == [
+    actions = [entry.action for entry in rig.audit]
+    assert actions == [
         AuditAction.RECALIBRATION_BEGUN,
         AuditAction.RECALIBRATION_ENDED,
     ]
-    assert rig.audit[-1].details["outcome"] == "stopped"
+    details = rig.audit[-1].details
+    assert details["outcome"] == "stopped"
     assert rig.audit[-1].details["exit_code"] == code
     assert type(caught.value).__name__ in session.state.problem
-    assert f'exit_code{{cell="demo"}} {code}.0' in (rig.cells / "drivegain_demo.prom").read_text()
-    assert "stopped" in (session.folder / "summary.txt").read_text()
+    text = (rig.cells / "drivegain_demo.prom").read_text()
+    assert f'exit_code{{cell="demo"}} {code}.0' in text
+    summary_path = session.folder / "summary.txt"
+    assert "stopped" in summary_path.read_text()
     return caught.value
 
 
@@ -85,12 +89,12 @@ def test_a_fault_in_motion_ends_the_job_and_leaves_the_controller_as_it_was(
     tmp_path: Path, short_plan: Path, name: str
 ) -> None:
     promise = STOPS[name]
-    rig = make_rig(tmp_path / "cell", short_plan)
+    folder = tmp_path / "cell"
+    rig = make_rig(folder, short_plan)
     if promise.toggle_bit is not None:
         with_toggle_bit(rig, promise.toggle_bit)
-    with serving(
-        rig, replace(promise.fault, at_cycle=STRIKE), toggle_bit=promise.toggle_bit
-    ) as cell:
+    changed_fault = replace(promise.fault, at_cycle=STRIKE)
+    with serving(rig, changed_fault, toggle_bit=promise.toggle_bit) as cell:
         fails(rig, cell, promise.error)
         assert powerless(cell)
     assert exit_code(promise.error) == ExitCode.DEVICE_FAULT
@@ -103,7 +107,8 @@ def test_a_cell_that_is_cut_off_ends_the_job_and_what_no_one_can_reach_is_said(
     tmp_path: Path, short_plan: Path, name: str
 ) -> None:
     fault, kind = CUT_OFF[name]
-    rig = make_rig(tmp_path / "cell", short_plan)
+    folder = tmp_path / "cell"
+    rig = make_rig(folder, short_plan)
     with serving(rig, fault) as cell:
         error = fails(rig, cell, kind)
         # Those that can be reached are stopped; the others stop by themselves (tests/faults), after
@@ -113,19 +118,23 @@ def test_a_cell_that_is_cut_off_ends_the_job_and_what_no_one_can_reach_is_said(
             for index, node in enumerate(cell.nodes)
             if fault.axis is not None and index != fault.axis
         ]
-        assert {node.drive.state for node in others} <= {PowerState.SWITCH_ON_DISABLED}
+        states = {node.drive.state for node in others}
+        assert states <= {PowerState.SWITCH_ON_DISABLED}
     assert any(note.startswith("while stopping") for note in error.__notes__)
-    assert "while stopping" in (rig.session.folder / "summary.txt").read_text()
+    summary_path = rig.session.folder / "summary.txt"
+    assert "while stopping" in summary_path.read_text()
 
 
 @pytest.mark.parametrize("kind", REFUSALS, ids=lambda kind: kind.value)
 def test_a_fault_from_the_start_ends_the_job_before_anything_moves(
     tmp_path: Path, short_plan: Path, kind: FaultKind
 ) -> None:
-    rig = make_rig(tmp_path / "cell", short_plan)
+    folder = tmp_path / "cell"
+    rig = make_rig(folder, short_plan)
     with serving(rig, FaultSpec(kind, 1)) as cell:
         fails(rig, cell, REFUSALS[kind][0])
-        assert {node.drive.state for node in cell.nodes} == {PowerState.SWITCH_ON_DISABLED}
+        states = {node.drive.state for node in cell.nodes}
+        assert states == {PowerState.SWITCH_ON_DISABLED}
         assert cell.plant.time_s < 1.0
 
 
@@ -135,25 +144,30 @@ def test_a_drive_that_refuses_its_mapping_ends_the_command_with_its_error(
     """As a timer calls it: an SDO abort of the library is behind the error that its feed
     describes.
     """
-    rig = make_rig(tmp_path / "cell", short_plan)
-    with serving(rig, FaultSpec(FaultKind.REFUSES_MAPPING, 1)) as cell:
+    folder = tmp_path / "cell"
+    rig = make_rig(folder, short_plan)
+    fault_spec = FaultSpec(FaultKind.REFUSES_MAPPING, 1)
+    with serving(rig, fault_spec) as cell:
         assert main(["recalibrate", str(rig.cell_file)]) == ExitCode.DEVICE_FAULT
-        assert {node.drive.state for node in cell.nodes} == {PowerState.SWITCH_ON_DISABLED}
-    last = json.loads(capsys.readouterr().err.splitlines()[-1])
+        states = {node.drive.state for node in cell.nodes}
+        assert states == {PowerState.SWITCH_ON_DISABLED}
+    lines = capsys.readouterr().err.splitlines()
+    last = json.loads(lines[-1])
     assert (last["event"], last["error"]) == ("failed", "SetupRefused")
     assert last["text"].startswith("J2 (node 2): TPDO1: writing 0x0 to 1A00h:00: aborted")
-    assert (rig.session.state.outcome, rig.session.state.exit_code) == (
-        Outcome.STOPPED,
-        ExitCode.DEVICE_FAULT,
-    )
+    expected = (Outcome.STOPPED, ExitCode.DEVICE_FAULT)
+    outcome = rig.session.state.outcome
+    assert (outcome, rig.session.state.exit_code) == expected
 
 
 def test_a_run_with_a_single_bad_frame_is_recorded_again(tmp_path: Path, one_move: Path) -> None:
     """Once its recorder accepts the run the job goes on,
     here to a payload that is never mounted.
     """
-    rig = make_rig(tmp_path / "cell", one_move, retries=1, mount=ONLY_BARE)
-    with serving(rig, FaultSpec(FaultKind.LOST, AXIS, STRIKE, 1)) as cell:
+    folder = tmp_path / "cell"
+    rig = make_rig(folder, one_move, retries=1, mount=ONLY_BARE)
+    fault_spec = FaultSpec(FaultKind.LOST, AXIS, STRIKE, 1)
+    with serving(rig, fault_spec) as cell:
         assert "mount command" in str(fails(rig, cell, JobHeld))
         assert powerless(cell)
     (run,) = rig.session.state.runs
@@ -163,11 +177,13 @@ def test_a_run_with_a_single_bad_frame_is_recorded_again(tmp_path: Path, one_mov
 
 def test_faults_with_which_a_run_goes_on_do_not_end_the_job(tmp_path: Path, one_move: Path) -> None:
     policy = {"motion": "allowed", "unguarded": "allowed"}
-    rig = make_rig(tmp_path / "cell", one_move, policy=policy, retries=0, mount=ONLY_BARE)
+    folder = tmp_path / "cell"
+    rig = make_rig(folder, one_move, policy=policy, retries=0, mount=ONLY_BARE)
     with serving(rig, *BORNE) as cell:
         assert "mount command" in str(fails(rig, cell, JobHeld))
         assert powerless(cell)
-    assert [run.name for run in rig.session.state.runs] == ["bare-1"]
+    runs = rig.session.state.runs
+    assert [run.name for run in runs] == ["bare-1"]
     warned = [event["text"] for event in rig.events if event["level"] == "warning"]
     assert [text for text in warned if "no 1016h" in text]
 
@@ -175,10 +191,13 @@ def test_faults_with_which_a_run_goes_on_do_not_end_the_job(tmp_path: Path, one_
 def test_a_job_moves_no_axis_that_would_go_on_without_it_unless_the_cell_says_so(
     tmp_path: Path, one_move: Path
 ) -> None:
-    rig = make_rig(tmp_path / "cell", one_move)
-    with serving(rig, FaultSpec(FaultKind.NO_GUARD, AXIS)) as cell:
+    folder = tmp_path / "cell"
+    rig = make_rig(folder, one_move)
+    fault_spec = FaultSpec(FaultKind.NO_GUARD, AXIS)
+    with serving(rig, fault_spec) as cell:
         error = fails(rig, cell, MotionRefused)
-        assert {node.drive.state for node in cell.nodes} == {PowerState.SWITCH_ON_DISABLED}
+        states = {node.drive.state for node in cell.nodes}
+        assert states == {PowerState.SWITCH_ON_DISABLED}
         assert cell.plant.time_s < 1.0
     assert exit_code(type(error)) == ExitCode.USAGE
     assert "J3: no 1016h" in str(error)
@@ -196,19 +215,24 @@ def test_an_axis_beyond_its_limit_is_brought_back_by_a_job_where_the_cell_says_s
         policy = {"motion": "allowed", "recovery_motion": "allowed"}
     else:
         policy = {"motion": "allowed"}
-    rig = make_rig(tmp_path / "cell", one_move, policy=policy, mount=ONLY_BARE)
+    folder = tmp_path / "cell"
+    rig = make_rig(folder, one_move, policy=policy, mount=ONLY_BARE)
     spec = load_simulation(shipped_simulation("demo"))
     start_rad = spec.start_rad.copy()
-    limit_rad = rig.cell.axes[AXIS].limits.position[1]
+    limits = rig.cell.axes[AXIS].limits
+    limit_rad = limits.position[1]
     start_rad[AXIS] = limit_rad + 0.002
-    with serving(rig, spec=replace(spec, start_rad=start_rad)) as cell:
+    changed_spec = replace(spec, start_rad=start_rad)
+    with serving(rig, spec=changed_spec) as cell:
         error = fails(rig, cell, JobHeld if allowed else MotionRefused)
         assert powerless(cell)
         assert bool(cell.plant.position_rad[AXIS] < limit_rad) is allowed
     warned = [event["text"] for event in rig.events if event["level"] == "warning"]
     assert any("brought back slowly" in text for text in warned) is allowed
     assert ("recovery_motion" in str(error)) is not allowed
-    assert [run.name for run in rig.session.state.runs] == ["bare-1"] * allowed
+    expected = ["bare-1"] * allowed
+    runs = rig.session.state.runs
+    assert [run.name for run in runs] == expected
 
 
 def test_no_kind_of_fault_is_left_out() -> None:
@@ -223,8 +247,10 @@ def test_a_run_that_is_invalid_whenever_it_is_made_ends_the_job(
     tmp_path: Path, one_move: Path, kind: FaultKind
 ) -> None:
     """A single bad frame of any kind makes it so."""
-    rig = make_rig(tmp_path / "cell", one_move, retries=0)
-    with serving(rig, FaultSpec(kind, AXIS, STRIKE, 1)) as cell:
+    folder = tmp_path / "cell"
+    rig = make_rig(folder, one_move, retries=0)
+    fault_spec = FaultSpec(kind, AXIS, STRIKE, 1)
+    with serving(rig, fault_spec) as cell:
         fails(rig, cell, RunInvalid)
         assert powerless(cell)
     assert rig.session.state.exit_code == ExitCode.DATA_UNFIT
@@ -233,12 +259,15 @@ def test_a_run_that_is_invalid_whenever_it_is_made_ends_the_job(
 def test_a_drive_in_fault_and_one_that_has_power_are_a_persons_business(
     tmp_path: Path, short_plan: Path
 ) -> None:
-    rig = make_rig(tmp_path / "cell", short_plan)
+    folder = tmp_path / "cell"
+    rig = make_rig(folder, short_plan)
     with serving(rig) as cell:
         cell.nodes[AXIS].drive.state = PowerState.FAULT
         fails(rig, cell, DriveFault)
-        assert cell.nodes[AXIS].drive.state is PowerState.FAULT
-    rig = make_rig(tmp_path / "other", short_plan)
+        drive = cell.nodes[AXIS].drive
+        assert drive.state is PowerState.FAULT
+    other_folder = tmp_path / "other"
+    rig = make_rig(other_folder, short_plan)
     with serving(rig) as cell:
         cell.nodes[AXIS].drive.state = PowerState.OPERATION_ENABLED
         fails(rig, cell, StateRefused)
@@ -254,4 +283,5 @@ def with_toggle_bit(rig: Rig, bit: int) -> None:
         "where": "of a drive that this test makes up",
     }
     (rig.cells / "drives").mkdir()
-    (rig.cells / "drives" / shipped.name).write_text(yaml.safe_dump(profile), encoding="utf-8")
+    drives_folder = rig.cells / "drives"
+    (drives_folder / shipped.name).write_text(yaml.safe_dump(profile), encoding="utf-8")

@@ -73,9 +73,10 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("fleet")
     (plans,) = plans_of(1, exchanges=40, duration_s=5.5)
     for number in range(CELLS):
-        make_cell(
-            FleetCell(folder, number, plans, runs=3 if number < WITH_HOLDOUT else 2, period_us=4000)
+        made = FleetCell(
+            folder, number, plans, runs=3 if number < WITH_HOLDOUT else 2, period_us=4000
         )
+        make_cell(made)
     return folder
 
 
@@ -85,8 +86,10 @@ def single(fleet: Path) -> dict[str, dict[str, Any]]:
     made = {}
     for folder in sorted(fleet.iterdir()):
         holdout = [log for log in (folder / "held-out.mcap",) if log.exists()]
-        fitted = fit([folder / "bare.mcap", folder / "loaded.mcap"], holdout=holdout)
-        made[folder.name] = _timeless(as_document(calibration_of(fitted, CREATED)))
+        logs = [folder / "bare.mcap", folder / "loaded.mcap"]
+        fitted = fit(logs, holdout=holdout)
+        document = as_document(calibration_of(fitted, CREATED))
+        made[folder.name] = _timeless(document)
     return made
 
 
@@ -105,7 +108,8 @@ def _timeless(document: dict[str, object]) -> dict[str, Any]:
 
 def _files(out: Path) -> dict[str, dict[str, Any]]:
     """Calibrations in a folder, by cell."""
-    made = [load_calibration(file) for file in sorted(out.glob("*.yaml"))]
+    sorted_files = sorted(out.glob("*.yaml"))
+    made = [load_calibration(file) for file in sorted_files]
     return {calibration.cell: _timeless(as_document(calibration)) for calibration in made}
 
 
@@ -138,16 +142,18 @@ def test_threads_give_each_cell_what_a_single_fit_gives(
     document = json.loads(capsys.readouterr().out)
     assert (document["fitted"], document["failed"]) == (CELLS, 0)
     assert _files(out) == single
-    assert [cell["error_on"] for cell in document["cells"]] == ["holdout"] * WITH_HOLDOUT + [
-        "fit"
-    ] * (CELLS - WITH_HOLDOUT)
-    rows = list(csv.DictReader(io.StringIO(table.read_text())))
+    expected = ["holdout"] * WITH_HOLDOUT + ["fit"] * (CELLS - WITH_HOLDOUT)
+    assert [cell["error_on"] for cell in document["cells"]] == expected
+    string_io = io.StringIO(table.read_text())
+    rows = list(csv.DictReader(string_io))
     for row, cell in zip(rows, document["cells"], strict=True):
         assert row["cell"] == cell["cell"]
+        gains = single[row["cell"]]["gains"]
         assert [float(row[f"{gain['axis']} gain"]) for gain in cell["gains"]] == [
-            gain["value"] for gain in single[row["cell"]]["gains"]
+            gain["value"] for gain in gains
         ]
-        assert load_calibration(Path(row["calibration"])).cell == row["cell"]
+        path = Path(row["calibration"])
+        assert load_calibration(path).cell == row["cell"]
 
 
 @pytest.mark.processes
@@ -179,7 +185,8 @@ def test_a_scheduler_that_runs_already_gives_the_same(
         )
         assert len(cluster.scheduler.workers) == 1  # it goes on
     made = _files(out)
-    assert made == {cell: single[cell] for cell in made}
+    expected = {cell: single[cell] for cell in made}
+    assert made == expected
     assert len(made) == 3
 
 
@@ -201,31 +208,37 @@ def test_a_cell_that_cannot_be_fitted_is_a_row_and_not_the_end(
 ) -> None:
     (few / "cell-000" / "loaded.mcap").unlink()
     (few / "cell-000" / "held-out.mcap").unlink()
-    whole = (few / "cell-002" / "bare.mcap").read_bytes()
+    bare_path = few / "cell-002" / "bare.mcap"
+    whole = bare_path.read_bytes()
     (few / "cell-002" / "bare.mcap").write_bytes(whole[: len(whole) // 2])
     (few / "ownerless.mcap").write_bytes(b"\x89MCAP0\r\nno log of ours")
-    write(few / "foreign.mcap", content(2), samples([(1, 2)] * 5))
+    path = few / "foreign.mcap"
+    write(path, content(2), samples([(1, 2)] * 5))
     assert main(["fleet", str(few), "--json"]) == ExitCode.DATA_UNFIT
     document = json.loads(capsys.readouterr().out)
     errors = {cell["cell"]: cell["error"] and cell["error"]["kind"] for cell in document["cells"]}
-    assert errors == {
+    expected = {
         "cell-000": "PayloadMissing",
         "cell-002": "LogTruncated",
         "cell-003": None,
         "foreign.mcap": "SchemaMismatch",
         "ownerless.mcap": "LogTruncated",
     }
-    assert [cell["exit_code"] for cell in document["cells"]] == [4, 4, 0, 6, 4]
+    assert errors == expected
+    exit_codes = [cell["exit_code"] for cell in document["cells"]]
+    assert exit_codes == [4, 4, 0, 6, 4]
     (truncated,) = (cell for cell in document["cells"] if cell["cell"] == "cell-002")
-    assert str(few / "cell-002" / "bare.mcap") in truncated["error"]["text"]
+    text = truncated["error"]["text"]
+    assert str(few / "cell-002" / "bare.mcap") in text
 
 
 def test_a_run_that_its_recorder_marked_invalid_is_reported_its_cell(
     tmp_path: Path, checkout: Path
 ) -> None:
     files = bundle(checkout / "configs/cells/demo.yaml")
+    path = tmp_path / "a.mcap"
     write(
-        tmp_path / "a.mcap",
+        path,
         content(6, None, files),
         samples([(0,) * 6] * 9),
         verdict=(False, "the drives fell off"),
@@ -243,14 +256,15 @@ def test_two_configurations_of_a_cell_are_two_rows_and_said_so(
     files = bundle(checkout / "configs/cells/demo.yaml")
     other = files | {"cell.yaml": files["cell.yaml"] + b"\n# moved to another hall\n"}
     for name, carried in (("a", files), ("b", other), ("c", files)):
-        write(tmp_path / f"{name}.mcap", content(6, None, carried), samples([(0,) * 6] * 9))
+        path = tmp_path / f"{name}.mcap"
+        write(path, content(6, None, carried), samples([(0,) * 6] * 9))
     assert main(["fleet", str(tmp_path), "--json"]) == ExitCode.DATA_UNFIT
-    document = json.loads(capsys.readouterr().out)["cells"]
-    assert [(cell["cell"], cell["configurations"]) for cell in document] == [
-        ("demo", 2),
-        ("demo", 2),
-    ]
-    assert sorted(len(cell["fit"]) for cell in document) == [1, 2]
+    printed = capsys.readouterr().out
+    document = json.loads(printed)["cells"]
+    expected = [("demo", 2), ("demo", 2)]
+    assert [(cell["cell"], cell["configurations"]) for cell in document] == expected
+    sorted_fit_counts = sorted(len(cell["fit"]) for cell in document)
+    assert sorted_fit_counts == [1, 2]
     assert main(["fleet", str(tmp_path)]) == ExitCode.DATA_UNFIT
     assert "demo: logs of 2 configurations" in " ".join(capsys.readouterr().out.split())
 
@@ -258,10 +272,12 @@ def test_two_configurations_of_a_cell_are_two_rows_and_said_so(
 def test_a_second_run_does_only_what_is_new(few: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     first = _fitted(few, out)
-    assert [row.kept for row in first] == [False] * 3
+    expected = [False] * 3
+    assert [row.kept for row in first] == expected
     second = _fitted(few, out)
     assert [row.kept for row in second] == [True] * 3
-    assert second == tuple(replace(row, kept=True) for row in first)
+    changed_rows = tuple(replace(row, kept=True) for row in first)
+    assert second == changed_rows
     # Another log, another content, a damaged calibration, a state that is none.
     (few / "cell-000" / "held-out.mcap").unlink()
     assert [row.kept for row in _fitted(few, out)] == [False, True, True]
@@ -271,13 +287,16 @@ def test_a_second_run_does_only_what_is_new(few: Path, tmp_path: Path) -> None:
     assert [row.kept for row in third] == [True, False, True]
     assert not third[1].fitted
     assert third[2].file is not None
-    third[2].file.write_bytes(third[2].file.read_bytes().replace(b"cell-003", b"cell-004"))
+    changed_content = third[2].file.read_bytes().replace(b"cell-003", b"cell-004")
+    third[2].file.write_bytes(changed_content)
     assert [row.kept for row in _fitted(few, out)] == [True, False, False]
-    third[2].file.with_suffix(".json").write_text("[]")
+    file = third[2].file
+    file.with_suffix(".json").write_text("[]")
     assert [row.kept for row in _fitted(few, out)] == [True, False, False]
     for cell in ("cell-000", "cell-002"):
         shutil.rmtree(few / cell)
-    assert _reported(_fitted(few, None)) == [replace(_reported(third)[2], file=None)]
+    rows = _fitted(few, None)
+    assert _reported(rows) == [replace(_reported(third)[2], file=None)]
 
 
 def _only(few: Path, cell: str) -> CellLogs:
@@ -300,9 +319,11 @@ def test_a_file_on_the_shelf_that_is_too_large_is_replaced(
     file.unlink()
     with file.open("wb") as stream:
         stream.truncate(2**40)
-    assert _reported(_fitted(few, out)) == _reported((first,))
+    rows = _fitted(few, out)
+    assert _reported(rows) == _reported((first,))
     assert file.is_file()
-    assert file.stat().st_size < 2**20
+    st_size = file.stat().st_size
+    assert st_size < 2**20
     (third,) = _fitted(few, out)
     assert third.kept
 
@@ -337,7 +358,8 @@ def test_a_folder_that_comes_in_the_place_of_a_note_meanwhile_is_reported_by_its
     few: Path, tmp_path: Path
 ) -> None:
     cell = _only(few, "cell-003")
-    shelf = open_cache(tmp_path / "out", Loop.OPEN)
+    folder = tmp_path / "out"
+    shelf = open_cache(folder, Loop.OPEN)
     made = fit_cell(cell, Loop.OPEN, CREATED)
     note = shelf.file(cell).with_suffix(".json")
     note.mkdir()
@@ -379,18 +401,21 @@ def test_killed_in_the_middle_and_started_again_it_gives_the_same(
     fleet: Path, single: dict[str, dict[str, Any]], tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
+    env = os.environ | {"OMP_NUM_THREADS": "1"}
     done = subprocess.run(
         [sys.executable, "-c", KILLED, str(fleet), str(out), "2"],
         check=False,
-        env=os.environ | {"OMP_NUM_THREADS": "1"},
+        env=env,
     )
     assert done.returncode == -signal.SIGKILL
     again = _fitted(fleet, out)
     assert 2 <= sum(row.kept for row in again) < CELLS
-    assert [row.cell for row in again] == sorted(single)
+    cells = [row.cell for row in again]
+    assert cells == sorted(single)
     assert _files(out) == single
     # No half file is left beside the calibrations and their states.
-    assert len(list(out.iterdir())) == 2 * CELLS
+    files = list(out.iterdir())
+    assert len(files) == 2 * CELLS
 
 
 def test_an_object_store_is_read_in_the_workers_and_leaves_nothing_behind(
@@ -406,7 +431,8 @@ def test_an_object_store_is_read_in_the_workers_and_leaves_nothing_behind(
         out = tmp_path / "out"
         assert main(["fleet", "memory://hall", "--out", str(out)]) == ExitCode.OK
         made = _files(out)
-        assert made == {cell: single[cell] for cell in made}
+        expected = {cell: single[cell] for cell in made}
+        assert made == expected
         assert len(made) == 3
         assert list(scratch.iterdir()) == []
         seen = by_cell(
@@ -427,7 +453,8 @@ def test_an_object_store_is_read_in_the_workers_and_leaves_nothing_behind(
 def test_a_folder_by_its_address_is_that_folder(few: Path) -> None:
     by_path = list_logs(str(few))
     by_address = list_logs(f"file://{few}")
-    assert [log.name for log in by_path] == [log.name for log in by_address]
+    expected = [log.name for log in by_address]
+    assert [log.name for log in by_path] == expected
     reported = [[(log.cell, log.mounting, log.started_ns) for log in survey(logs) if isinstance(log, SeenLog)]  # noqa: E501
             for logs in (by_path, by_address)]  # fmt: skip
     assert reported[0] == reported[1]
@@ -441,7 +468,8 @@ def test_a_name_of_a_log_that_is_no_file_is_a_row(
     """None of them is opened: nothing would ever open the other end of the pipe."""
     logs = tmp_path / "logs"
     (logs / "folder.mcap").mkdir(parents=True)
-    (logs / "folder.mcap" / "gone.mcap").symlink_to(tmp_path / "unmounted.mcap")
+    gone_path = logs / "folder.mcap" / "gone.mcap"
+    gone_path.symlink_to(tmp_path / "unmounted.mcap")
     (logs / "link.mcap").symlink_to(logs / "folder.mcap")
     (logs / "round.mcap").symlink_to(logs / "round.mcap")
     (logs / "zero.mcap").symlink_to("/dev/zero")
@@ -449,10 +477,10 @@ def test_a_name_of_a_log_that_is_no_file_is_a_row(
     with socket.socket(socket.AF_UNIX) as one:
         one.bind(str(logs / "socket.mcap"))
         assert main(["fleet", address.format(logs), "--json"]) == ExitCode.DATA_UNFIT
-    output = {cell["cell"]: cell for cell in json.loads(capsys.readouterr().out)["cells"]}
-    assert {
-        name: cell["error"]["text"].split("; expected")[0] for name, cell in output.items()
-    } == {
+    printed = capsys.readouterr().out
+    cells = json.loads(printed)["cells"]
+    output = {cell["cell"]: cell for cell in cells}
+    expected = {
         "folder.mcap": f"{logs}/folder.mcap: found a folder",
         "folder.mcap/gone.mcap": f"{logs}/folder.mcap/gone.mcap: found a link to "
         f"{tmp_path}/unmounted.mcap, which leads nowhere",
@@ -462,6 +490,9 @@ def test_a_name_of_a_log_that_is_no_file_is_a_row(
         "socket.mcap": f"{logs}/socket.mcap: found something that is no regular file",
         "zero.mcap": f"{logs}/zero.mcap: found something that is no regular file",
     }
+    assert {
+        name: cell["error"]["text"].split("; expected")[0] for name, cell in output.items()
+    } == expected
     assert {(cell["error"]["kind"], cell["exit_code"]) for cell in output.values()} == {
         ("LogMissing", 4)
     }
@@ -477,8 +508,9 @@ def test_a_log_by_a_link_is_that_log(few: Path, tmp_path: Path) -> None:
 
 def test_a_pipe_that_takes_the_place_of_a_log_meanwhile_is_not_opened(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "a.mcap")
+    address = str(tmp_path / "a.mcap")
     with pytest.raises(LogMissing, match="no regular file"):
-        at_hand(StoredLog(str(tmp_path / "a.mcap"), "a.mcap"), tmp_path)
+        at_hand(StoredLog(address, "a.mcap"), tmp_path)
 
 
 @pytest.mark.parametrize("place", ["nowhere", "memory://nowhere", "."])
@@ -528,12 +560,11 @@ def test_processes_of_this_machine_listen_to_no_one_else() -> None:
         psutil = import_module("psutil")  # distributed brings it
         here = psutil.Process()
         ours = [here, *here.children(recursive=True)]
-        listening = [
-            connection.laddr.ip
-            for process in ours
-            for connection in process.net_connections("inet")
-            if connection.status == psutil.CONN_LISTEN
-        ]
+        listening = []
+        for process in ours:
+            for connection in process.net_connections("inet"):
+                if connection.status == psutil.CONN_LISTEN:
+                    listening.append(connection.laddr.ip)
     assert len(listening) >= 3
     assert set(listening) == {"127.0.0.1"}
 
@@ -557,7 +588,8 @@ def test_the_words_of_scheduler(monkeypatch: pytest.MonkeyPatch) -> None:
         fleet_module, "_scheduler", lambda *given: asked.append(("scheduler", *given))
     )
     with worker_pool("threads", 3) as pool, worker_pool("threads", None) as as_many_as_processors:
-        assert (pool.workers, as_many_as_processors.workers) == (3, len(os.sched_getaffinity(0)))
+        expected = (3, len(os.sched_getaffinity(0)))
+        assert (pool.workers, as_many_as_processors.workers) == expected
     worker_pool("processes", 2)
     worker_pool("tcp://10.0.0.1:8786", None)
     assert asked == [("processes", 2, None), ("scheduler", "tcp://10.0.0.1:8786", None)]
@@ -570,10 +602,8 @@ def test_another_file_is_never_replaced_by_a_table(few: Path, tmp_path: Path) ->
     notes.write_text("my notes\n")
     assert main(["fleet", str(few), "--csv", str(notes)]) == ExitCode.USAGE
     assert notes.read_text() == "my notes\n"
-    assert (
-        main(["fleet", str(few), "--csv", str(tmp_path / "absent" / "fleet.csv")])
-        == ExitCode.UNEXPECTED
-    )
+    fleet_path = tmp_path / "absent" / "fleet.csv"
+    assert main(["fleet", str(few), "--csv", str(fleet_path)]) == ExitCode.UNEXPECTED
     assert main(["fleet", str(few), "--out", str(notes)]) == ExitCode.USAGE
 
 
@@ -587,7 +617,8 @@ def test_an_error_that_no_one_expected_is_a_row(few: Path, monkeypatch: pytest.M
     monkeypatch.setattr(fleet_module, "fit_cell", sometimes)
     rows = _fitted(few, None)
     assert [row.fitted for row in rows] == [True, False, True]
-    assert rows[1].result == Failure("MemoryError", "MemoryError", ExitCode.UNEXPECTED)
+    expected = Failure("MemoryError", "MemoryError", ExitCode.UNEXPECTED)
+    assert rows[1].result == expected
 
 
 def test_heads_that_no_one_could_read_are_rows(few: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -605,28 +636,38 @@ def test_a_name_that_is_no_text_ends_nothing(
 ) -> None:
     """Bytes that are no UTF-8, in a log of a cell and in one of no cell."""
     shutil.rmtree(few / "cell-000")
-    (few / "cell-002" / "bare.mcap").rename(few / "cell-002" / os.fsdecode(b"b\xff.mcap"))
+    bare_path = few / "cell-002" / "bare.mcap"
+    bare_path.rename(few / "cell-002" / os.fsdecode(b"b\xff.mcap"))
     (few / os.fsdecode(b"=c\xff\x1b[2J.mcap")).write_bytes(b"\x89MCAP0\r\nno log of ours")
     out = tmp_path / "out"
     table = tmp_path / "fleet.csv"
     assert main(["fleet", str(few), "--out", str(out), "--csv", str(table)]) == ExitCode.DATA_UNFIT
     assert "\x1b[2J" not in capsys.readouterr().out
-    assert [row["cell"] for row in csv.DictReader(io.StringIO(table.read_text()))] == [
+    string_io = io.StringIO(table.read_text())
+    dict_reader = csv.DictReader(string_io)
+    assert [row["cell"] for row in dict_reader] == [
         "cell-002",
         "cell-003",
         "'=c\\udcff\x1b[2J.mcap",
     ]
     assert main(["fleet", str(few), "--out", str(out), "--json"]) == ExitCode.DATA_UNFIT
-    cells = json.loads(capsys.readouterr().out.encode())["cells"]
-    assert [cell["exit_code"] for cell in cells] == [4, 0, 4]
-    assert "rename it" in cells[0]["error"]["text"]
+    printed = capsys.readouterr().out
+    cells = json.loads(printed.encode())["cells"]
+    exit_codes = [cell["exit_code"] for cell in cells]
+    assert exit_codes == [4, 0, 4]
+    error = cells[0]["error"]
+    assert "rename it" in error["text"]
     assert "b\\udcff.mcap" in " ".join(cells[0]["fit"])
 
 
 def test_a_log_that_changes_meanwhile_is_reported(few: Path) -> None:
-    cells = by_cell(log for log in survey(list_logs(str(few))) if isinstance(log, SeenLog))
-    shutil.copy(few / "cell-002" / "bare.mcap", few / "cell-003" / "loaded.mcap")
-    shutil.copy(few / "cell-000" / "loaded.mcap", few / "cell-000" / "held-out.mcap")
+    logs = list_logs(str(few))
+    cells = by_cell(log for log in survey(logs) if isinstance(log, SeenLog))
+    bare_path = few / "cell-002" / "bare.mcap"
+    shutil.copy(bare_path, few / "cell-003" / "loaded.mcap")
+    loaded_path = few / "cell-000" / "loaded.mcap"
+    held_out_path = few / "cell-000" / "held-out.mcap"
+    shutil.copy(loaded_path, held_out_path)
     kinds = [fit_cell(cell, Loop.OPEN, CREATED) for cell in cells]
     assert [made.kind if isinstance(made, Failure) else "" for made in kinds] == [
         "LogRepeated",
@@ -634,7 +675,9 @@ def test_a_log_that_changes_meanwhile_is_reported(few: Path) -> None:
         "LogsDiffer",
     ]
     whole = cells[1]
-    stale = replace(whole, fit=(replace(whole.fit[0], fingerprint="0" * 64), *whole.fit[1:]))
+    fingerprint = "0" * 64
+    changed_fit = replace(whole.fit[0], fingerprint=fingerprint)
+    stale = replace(whole, fit=(changed_fit, *whole.fit[1:]))
     made = fit_cell(stale, Loop.OPEN, CREATED)
     assert isinstance(made, Failure)
     assert "another content" in made.text
@@ -662,7 +705,8 @@ def test_workers_that_have_gone_end_it(cancels: bool, monkeypatch: pytest.Monkey
     def submit(piece: int) -> Future[str]:
         return pool.executor.submit(str, piece)
 
-    outcomes = each(submit, (1, 2, 3), pool)
+    work = (1, 2, 3)
+    outcomes = each(submit, work, pool)
     with pytest.raises(WorkersLost, match="goes on where it was"):
         next(outcomes)
 
@@ -681,10 +725,12 @@ def test_no_more_is_in_work_than_there_are_workers(workers: int, pieces: int) ->
             return executor.submit(pow, piece, 2)
 
         results = {}
-        for piece, made in each(submit, range(pieces), WorkerPool(executor, workers, lambda: True)):
+        pool = WorkerPool(executor, workers, lambda: True)
+        for piece, made in each(submit, range(pieces), pool):
             results[piece] = made
             back += 1
-    assert results == {piece: piece**2 for piece in range(pieces)}
+    expected = {piece: piece**2 for piece in range(pieces)}
+    assert results == expected
     # The next one goes out before the finished one is examined.
     assert most <= workers + 1
 
@@ -715,9 +761,10 @@ def test_every_log_has_one_role_in_one_cell(logs: list[SeenLog], random: Any) ->
     )
     assert len({(cell.cell, cell.configuration_sha256) for cell in cells}) == len(cells)
     for cell in cells:
-        assert {(seen.cell, seen.configuration_sha256) for seen in (*cell.fit, *cell.holdout)} == {
-            (cell.cell, cell.configuration_sha256)
-        }
+        expected = {(cell.cell, cell.configuration_sha256)}
+        assert {
+            (seen.cell, seen.configuration_sha256) for seen in (*cell.fit, *cell.holdout)
+        } == expected
         fitted = [seen.mounting for seen in cell.fit]
         assert len(cell.holdout) <= 1
         for held in cell.holdout:
@@ -727,7 +774,8 @@ def test_every_log_has_one_role_in_one_cell(logs: list[SeenLog], random: Any) ->
                 seen.started_ns <= held.started_ns for seen in cell.fit if seen.mounting is not None
             )
         if not cell.holdout and None in fitted:
-            newest = [mounting for mounting in fitted if mounting is not None][-1:]
+            mountings = [mounting for mounting in fitted if mounting is not None]
+            newest = mountings[-1:]
             assert all(fitted.count(mounting) == 1 for mounting in newest)
     shuffled = list(logs)
     random.shuffle(shuffled)
@@ -736,7 +784,9 @@ def test_every_log_has_one_role_in_one_cell(logs: list[SeenLog], random: Any) ->
 
 def test_a_log_that_cannot_be_read_is_reported_by_its_name(tmp_path: Path) -> None:
     (tmp_path / "gone.mcap").symlink_to(tmp_path / "nowhere")
-    (found,) = survey([StoredLog(str(tmp_path / "gone.mcap"), "gone.mcap")])
+    address = str(tmp_path / "gone.mcap")
+    logs = [StoredLog(address, "gone.mcap")]
+    (found,) = survey(logs)
     assert isinstance(found, UnknownLog)
     assert isinstance(found.error, DaqError)
 

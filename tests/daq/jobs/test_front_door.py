@@ -53,10 +53,10 @@ def test_the_documented_lines_write_the_gains(
 ) -> None:
     rig, made = whole_job
     for folder in ("cells", "controllers", "robots"):
-        shutil.copytree(
-            rig.folder / folder, tmp_path / folder, ignore=shutil.ignore_patterns("*.recalibration")
-        )
-    document = json.loads((tmp_path / "cells/demo.yaml").read_text())
+        ignore = shutil.ignore_patterns("*.recalibration")
+        shutil.copytree(rig.folder / folder, tmp_path / folder, ignore=ignore)
+    text = (tmp_path / "cells/demo.yaml").read_text()
+    document = json.loads(text)
     document["policy"]["apply"]["max_age_days"] = None  # the logs are of another day
     (tmp_path / "cells/press.yaml").write_text(json.dumps(document))
     controller = tmp_path / "controllers/demo.yaml"
@@ -73,21 +73,22 @@ def test_the_documented_lines_write_the_gains(
     given: dict[str, Any] = {"Path": Path, "datetime": datetime, "UTC": UTC}
     exec("\n".join(lines), given)  # noqa: S102 - the documented lines themselves are what is tested
     calibration = daq.load_calibration(Path("calibration.yaml"))
-    assert capsys.readouterr().out.count("±") == len(calibration.gains) == 6
+    printed = capsys.readouterr().out
+    assert printed.count("±") == len(calibration.gains) == 6
     assert given["proposal"].refusals == ()
     assert controller.read_bytes() != before.read_bytes()
     # Written with audit log and history, of which nothing is missing.
     history = history_of(Path("cells/press.yaml"))
     (entry,) = history.entries
-    assert [(event.who, event.digest) for event in history.events] == [("Ada", entry.digest)]
+    expected = [("Ada", entry.digest)]
+    assert [(event.who, event.digest) for event in history.events] == expected
     assert history.in_force(str(controller.resolve())) == sha256(
         Path("calibration.yaml").read_bytes()
     )
     assert main(["history", "cells/press.yaml", "--verify"]) == 0
     # The same numbers as the job's fit of the same logs.
-    assert [gain.value for gain in calibration.gains] == [
-        gain.value for gain in made.calibration.gains
-    ]
+    gains = [gain.value for gain in made.calibration.gains]
+    assert [gain.value for gain in calibration.gains] == gains
     (validation,) = daq.validate(calibration, [Path("held-out.mcap")])
     assert calibration.holdout_error_percent is not None
     assert validation.error.total == pytest.approx(

@@ -110,15 +110,21 @@ def test_a_session_over_the_driver_finds_the_gains_writes_them_once_and_accepts_
         "block-2-loaded",
         "block-3-held-out",
     ]
-    assert [run.name for run in state.runs] == [block.name for block in state.blocks]
+    expected = [block.name for block in state.blocks]
+    assert [run.name for run in state.runs] == expected
     assert all(gain.is_precise for gain in state.gains)
-    truth = load_simulation(shipped_configurations() / "simulation" / "demo.yaml", None)
-    calibration = yaml.safe_load((rig.session.folder / "calibration.yaml").read_text())
-    written = yaml.safe_load(rig.controller.read_text())["drives"]
+    path = shipped_configurations() / "simulation" / "demo.yaml"
+    truth = load_simulation(path, None)
+    calibration_path = rig.session.folder / "calibration.yaml"
+    calibration = yaml.safe_load(calibration_path.read_text())
+    document = yaml.safe_load(rig.controller.read_text())
+    written = document["drives"]
     for gain, axis in zip(calibration["gains"], truth.axes, strict=True):
-        assert abs(gain["value"] - axis.gain_nm_per_a) < 4.0 * gain["std"], gain["axis"]
+        difference = abs(gain["value"] - axis.gain_nm_per_a)
+        assert difference < 4.0 * gain["std"], gain["axis"]
         assert written[gain["axis"]]["gain"] == pytest.approx(gain["value"], rel=1e-3)
-    assert [entry.action for entry in rig.audit] == [
+    actions = [entry.action for entry in rig.audit]
+    assert actions == [
         AuditAction.RECALIBRATION_BEGUN,
         AuditAction.CALIBRATION_ENTERED,
         AuditAction.APPLY_BEGUN,
@@ -126,7 +132,8 @@ def test_a_session_over_the_driver_finds_the_gains_writes_them_once_and_accepts_
         AuditAction.ACCEPTED,
         AuditAction.RECALIBRATION_ENDED,
     ]
-    assert len(history_of(rig.cell_file).events) == 1
+    events = history_of(rig.cell_file).events
+    assert len(events) == 1
     assert len(rig.backups) == 1
 
 
@@ -148,7 +155,8 @@ def test_new_moves_show_which_gains_were_wrong_before_the_write(
 def test_a_gain_that_is_wrong_after_the_write_is_not_accepted(
     tmp_path: Path, made_session: MadeSession
 ) -> None:
-    rig = made_session_rig(tmp_path / "cell", made_session)
+    folder = tmp_path / "cell"
+    rig = made_session_rig(folder, made_session)
     # The controller did not take the gains that were written: it has the previous gains.
     rig.tools = replace(rig.tools, validate=lambda *_: (made_session.before,))
     ended = run_session(rig)
@@ -175,7 +183,8 @@ def test_a_gain_that_is_wrong_after_the_write_is_not_accepted(
     assert entry.details["undo"] == undo
     (event,) = [event for event in rig.events if event["event"] == "not accepted"]
     assert event["undo"] == undo
-    page = (rig.session.folder / "report" / "report.html").read_text()
+    report_folder = rig.session.folder / "report"
+    page = (report_folder / "report.html").read_text()
     assert "NOT ACCEPTED on " in page
     assert undo in page
     (calibration,) = history_of(rig.cell_file).entries
@@ -191,14 +200,16 @@ def test_the_session_leaves_files_that_the_other_verbs_read(
         "motion": "allowed",
         "apply": {"by": "job", "max_std_percent": 8, "max_age_days": None},
     }
-    rig = made_session_rig(tmp_path / "cell", made_session, policy=policy)
+    folder = tmp_path / "cell"
+    rig = made_session_rig(folder, made_session, policy=policy)
     assert run_session(rig).exit_code == ExitCode.OK
     assert main(["history", str(rig.cell_file), "--verify"]) == ExitCode.OK
     assert main(["rollback", str(rig.cell_file)]) == ExitCode.OK
     calibration = rig.session.folder / "calibration.yaml"
     assert main(["apply", str(rig.cell_file), str(calibration), "--json"]) == ExitCode.OK
     capsys.readouterr()
-    summary = json.loads((rig.session.folder / "summary.json").read_text())
+    summary_path = rig.session.folder / "summary.json"
+    summary = json.loads(summary_path.read_text())
     assert summary["format"] == "drivegain-session"
     assert summary["outcome"] == "applied"
     assert "drivegain rollback" in " ".join(summary["to_do"])
@@ -244,7 +255,8 @@ class Interruption:
 @pytest.fixture(scope="module")
 def calls(tmp_path_factory: pytest.TempPathFactory, made_session: MadeSession) -> list[str]:
     """Calls of a session that runs to its end."""
-    rig = made_session_rig(tmp_path_factory.mktemp("counted") / "cell", made_session)
+    folder = tmp_path_factory.mktemp("counted") / "cell"
+    rig = made_session_rig(folder, made_session)
     counted = Interruption()
     rig.tools = counted.tools(rig.tools)
     assert run_session(rig).outcome is Outcome.APPLIED
@@ -253,7 +265,8 @@ def calls(tmp_path_factory: pytest.TempPathFactory, made_session: MadeSession) -
 
 def test_every_tool_is_among_the_calls(calls: list[str]) -> None:
     assert set(calls) == set(CALLED)
-    assert calls.count("record") == len(FIRST_BLOCKS) + 1
+    expected = len(FIRST_BLOCKS) + 1
+    assert calls.count("record") == expected
 
 
 def ends_the_same_after(rig: Rig, interruption: Interruption, error: BaseException) -> None:
@@ -270,14 +283,16 @@ def ends_the_same_after(rig: Rig, interruption: Interruption, error: BaseExcepti
     state = state_of(rig)
     assert state.acceptance is not None
     assert state.acceptance.accepted
-    assert [run.name for run in state.runs] == [block.name for block in state.blocks]
+    expected = [block.name for block in state.blocks]
+    assert [run.name for run in state.runs] == expected
     actions = [entry.action for entry in rig.audit]
     assert actions.count(AuditAction.APPLY_BEGUN) == 1
     assert actions.count(AuditAction.APPLIED) == 1
     assert actions.count(AuditAction.CALIBRATION_ENTERED) == 1
     assert actions.count(AuditAction.ACCEPTED) == 1
     assert len(rig.backups) == 1
-    assert len(history_of(rig.cell_file).events) == 1
+    events = history_of(rig.cell_file).events
+    assert len(events) == 1
 
 
 ERRORS = (KeyboardInterrupt, JobHeld)
@@ -301,7 +316,8 @@ def interrupted_at_each(
             else JobHeld("x", found="y", expected="z", remedy="w")
         )
         rig = made_session_rig(folder / f"{at}-{calls[at]}", made)
-        ends_the_same_after(rig, Interruption(error, at, after=after), error)
+        interruption = Interruption(error, at, after=after)
+        ends_the_same_after(rig, interruption, error)
     return len(chosen)
 
 
@@ -315,9 +331,8 @@ def test_a_session_that_is_interrupted_at_any_call_ends_with_the_same_outcome(
     kind: type[BaseException],
     after: bool,
 ) -> None:
-    assert interrupted_at_each(tmp_path, made_session, calls, CALLED, kind, after=after) == len(
-        calls
-    )
+    interrupted = interrupted_at_each(tmp_path, made_session, calls, CALLED, kind, after=after)
+    assert interrupted == len(calls)
 
 
 @pytest.mark.parametrize("name", QUICK)
@@ -327,12 +342,14 @@ def test_a_session_that_is_interrupted_goes_on_with_the_same_command(
     """At the last call of a tool; Ctrl-C before it, an error right after it has done its work."""
     last = len(calls) - 1 - calls[::-1].index(name)
     before = KeyboardInterrupt()
-    ends_the_same_after(
-        made_session_rig(tmp_path / "before", made_session), Interruption(before, last), before
-    )
+    before_folder = tmp_path / "before"
+    rig = made_session_rig(before_folder, made_session)
+    interruption = Interruption(before, last)
+    ends_the_same_after(rig, interruption, before)
     after = JobHeld("x", found="y", expected="z", remedy="w")
+    folder = tmp_path / "after"
     ends_the_same_after(
-        made_session_rig(tmp_path / "after", made_session),
+        made_session_rig(folder, made_session),
         Interruption(after, last, after=True),
         after,
     )
@@ -345,17 +362,22 @@ def test_the_certificate_says_who_wrote_and_accepted_the_gains(
     """Also where the command that has the fit was ended before the write:
     its details are still on the page.
     """
-    rig = made_session_rig(tmp_path / "cell", made_session)
-    tools = replace(rig.tools, save_report=partial(save_certificate, rig.cell_file, rig.cell))
+    folder = tmp_path / "cell"
+    rig = made_session_rig(folder, made_session)
+    save_report = partial(save_certificate, rig.cell_file, rig.cell)
+    tools = replace(rig.tools, save_report=save_report)
     rig.tools = tools
     if killed_at:
-        rig.tools = Interruption(KeyboardInterrupt(), calls.index(killed_at)).tools(tools)
+        interruption = Interruption(KeyboardInterrupt(), calls.index(killed_at))
+        rig.tools = interruption.tools(tools)
         with pytest.raises(KeyboardInterrupt):
             run_session(rig)
-        assert "not written (as of " in (rig.session.folder / "report" / "report.html").read_text()
+        report_folder = rig.session.folder / "report"
+        assert "not written (as of " in (report_folder / "report.html").read_text()
         rig.tools = tools
     assert run_session(rig).outcome is Outcome.APPLIED
-    page = (rig.session.folder / "report" / "report.html").read_text()
+    report_path = rig.session.folder / "report" / "report.html"
+    page = report_path.read_text()
     assert f"by {escape(WHO)} to demo.yaml; accepted on " in page
     assert "not written" not in page
     assert "Measured and predicted torques" in page
@@ -367,7 +389,8 @@ def test_the_certificate_says_who_wrote_and_accepted_the_gains(
 def test_a_certificate_that_cannot_be_written_again_is_a_warning_with_what_to_do(
     tmp_path: Path, made_session: MadeSession
 ) -> None:
-    rig = made_session_rig(tmp_path / "cell", made_session)
+    folder = tmp_path / "cell"
+    rig = made_session_rig(folder, made_session)
 
     def refused(*_: object) -> Any:
         raise OutputFailed.of(Path("report.html"), OSError(errno.ENOSPC, "No space left on device"))
@@ -386,7 +409,8 @@ def test_a_result_that_is_no_number_accepts_nothing(
     tmp_path: Path, made_session: MadeSession
 ) -> None:
     """An axis that did not move in the acceptance run has no scale."""
-    rig = made_session_rig(tmp_path / "cell", made_session)
+    folder = tmp_path / "cell"
+    rig = made_session_rig(folder, made_session)
     moved = made_session.after.use.copy()
     moved[-1] = False
     rig.tools = replace(rig.tools, validate=lambda *_: (replace(made_session.after, use=moved),))
@@ -395,7 +419,8 @@ def test_a_result_that_is_no_number_accepts_nothing(
     acceptance = state_of(rig).acceptance
     assert acceptance is not None
     assert "J6 did not move" in acceptance.remark
-    assert AuditAction.NOT_ACCEPTED in {entry.action for entry in rig.audit}
+    actions = {entry.action for entry in rig.audit}
+    assert AuditAction.NOT_ACCEPTED in actions
 
 
 def test_a_session_that_was_killed_right_after_its_write_does_not_write_again(
@@ -404,12 +429,14 @@ def test_a_session_that_was_killed_right_after_its_write_does_not_write_again(
     """As a loss of power leaves it: the controller's file is new,
     and the state is that of before the write.
     """
-    rig = made_session_rig(tmp_path / "cell", made_session)
+    folder = tmp_path / "cell"
+    rig = made_session_rig(folder, made_session)
     before: list[bytes] = []
     write = rig.tools.apply
 
     def lost_power(*given: Any, **further: Any) -> Any:
-        before.append((rig.session.folder / "state.json").read_bytes())
+        state_path = rig.session.folder / "state.json"
+        before.append(state_path.read_bytes())
         write(*given, **further)
         raise KeyboardInterrupt
 
@@ -422,14 +449,16 @@ def test_a_session_that_was_killed_right_after_its_write_does_not_write_again(
     rig.clock.go_on(minutes=5)
     assert run_session(rig).outcome is Outcome.APPLIED
     assert rig.controller.read_bytes() == written
-    assert [entry.action for entry in rig.audit].count(AuditAction.APPLY_BEGUN) == 1
+    actions = [entry.action for entry in rig.audit]
+    assert actions.count(AuditAction.APPLY_BEGUN) == 1
     assert state_of(rig).acceptance is not None
 
 
 def test_the_interlock_is_asked_before_every_motion(
     tmp_path: Path, made_session: MadeSession
 ) -> None:
-    rig = made_session_rig(tmp_path / "cell", made_session, warm_up_min=0)
+    folder = tmp_path / "cell"
+    rig = made_session_rig(folder, made_session, warm_up_min=0)
     events: list[str] = []
     tools = rig.tools
 
@@ -445,21 +474,25 @@ def test_the_interlock_is_asked_before_every_motion(
     rig.tools = replace(tools, run=run, record=record)
     run_session(rig)
     motions = [index for index, event in enumerate(events) if event == "motion"]
-    assert len(motions) == len(FIRST_BLOCKS) + 1
+    expected = len(FIRST_BLOCKS) + 1
+    assert len(motions) == expected
     assert all(events[index - 1] == "interlock" for index in motions)
 
 
 def test_an_interlock_that_opens_between_blocks_ends_the_session_there(
     tmp_path: Path, made_session: MadeSession
 ) -> None:
-    rig = made_session_rig(tmp_path / "cell", made_session)
+    folder = tmp_path / "cell"
+    rig = made_session_rig(folder, made_session)
 
     def put(payload: str | None) -> None:
         if payload is not None:
             rig.closed.unlink()
 
-    assert ended_with(rig, given_answers(rig, put=put)) == ExitCode.NOT_RELEASED
-    assert [run.name for run in rig.session.state.runs] == ["block-1-bare"]
+    operator = given_answers(rig, put=put)
+    assert ended_with(rig, operator) == ExitCode.NOT_RELEASED
+    runs = rig.session.state.runs
+    assert [run.name for run in runs] == ["block-1-bare"]
     rig.closed.touch()
     assert run_session(rig).outcome is Outcome.APPLIED
     assert rig.session.state.attempt == 2
@@ -475,21 +508,24 @@ def ended_with(rig: Rig, operator: GivenAnswers) -> int | None:
 def test_a_session_ends_when_its_time_is_up_and_says_what_was_not_reached(
     tmp_path: Path, made_session: MadeSession
 ) -> None:
-    rig = made_session_rig(tmp_path / "cell", made_session)
+    folder = tmp_path / "cell"
+    rig = made_session_rig(folder, made_session)
     ended = run_session(rig, target_percent=0.1, time_limit_min=0.3)
     state = state_of(rig)
     assert ended.outcome is Outcome.APPLIED
     assert len(state.blocks) == len(FIRST_BLOCKS)
     assert "the target is 0.1 %" in state.missing
     assert "J3" in state.missing
-    assert f"Not reached: {state.missing}" in (rig.session.folder / "summary.txt").read_text()
+    text = (rig.session.folder / "summary.txt").read_text()
+    assert f"Not reached: {state.missing}" in text
 
 
 def test_a_closed_gate_refuses_the_write_and_the_session_is_over(
     tmp_path: Path, made_session: MadeSession
 ) -> None:
     policy = {"motion": "allowed", "apply": {"by": "job", "max_std_percent": 0.2}}
-    rig = made_session_rig(tmp_path / "cell", made_session)
+    folder = tmp_path / "cell"
+    rig = made_session_rig(folder, made_session)
     document = json.loads(rig.cell_file.read_text())
     document["policy"] = policy
     rig.cell_file.write_text(json.dumps(document))
@@ -503,19 +539,24 @@ def test_a_closed_gate_refuses_the_write_and_the_session_is_over(
 def test_without_yes_nothing_is_written_and_the_command_for_later_is_said(
     tmp_path: Path, made_session: MadeSession
 ) -> None:
-    rig = made_session_rig(tmp_path / "cell", made_session)
+    folder = tmp_path / "cell"
+    rig = made_session_rig(folder, made_session)
     before = rig.controller.read_bytes()
-    ended = run_session(rig, given_answers(rig, writes=False))
-    assert (ended.outcome, ended.exit_code) == (Outcome.PROPOSED, ExitCode.PROPOSED)
+    operator = given_answers(rig, writes=False)
+    ended = run_session(rig, operator)
+    expected = (Outcome.PROPOSED, ExitCode.PROPOSED)
+    assert (ended.outcome, ended.exit_code) == expected
     assert rig.controller.read_bytes() == before
     assert state_of(rig).acceptance is None
-    assert f"drivegain apply {rig.cell_file}" in (rig.session.folder / "summary.txt").read_text()
+    text = (rig.session.folder / "summary.txt").read_text()
+    assert f"drivegain apply {rig.cell_file}" in text
 
 
 def test_a_rehearsal_makes_the_moves_of_the_first_blocks_slowly_and_leaves_no_log(
     tmp_path: Path, made_session: MadeSession
 ) -> None:
-    rig = made_session_rig(tmp_path / "cell", made_session)
+    folder = tmp_path / "cell"
+    rig = made_session_rig(folder, made_session)
     made: list[tuple[str, float, float]] = []
     record = rig.tools.record
 
@@ -533,25 +574,25 @@ def test_a_rehearsal_makes_the_moves_of_the_first_blocks_slowly_and_leaves_no_lo
     rig.tools = replace(rig.tools, record=noting)
     with pytest.raises(KeyboardInterrupt):
         run_session(rig, rehearse=True)
-    assert run_session(rig, rehearse=True).outcome is Outcome.APPLIED
+    outcome = run_session(rig, rehearse=True).outcome
+    assert outcome is Outcome.APPLIED
     slow = [entry for entry in made if entry[0] == "warm-up"]
     quick_s = [made_session.plans[seed].duration_s for seed in (0, 1, 1, 2)]
-    assert [speed for _, speed, _ in slow] == [0.25] * 4
+    speeds = [speed for _, speed, _ in slow]
+    assert speeds == [0.25] * 4
     for (_, _, slow_s), full_s in zip(slow, quick_s, strict=True):
         assert slow_s > 2.0 * full_s
-    assert not list(rig.session.folder.glob("warm-up*"))
-    assert [name for name, speed, _ in made if speed == 1.0] == [
-        "block-1-bare",
-        "block-2-loaded",
-        "block-3-held-out",
-        "acceptance",
-    ]
+    files = rig.session.folder.glob("warm-up*")
+    assert not list(files)
+    expected = ["block-1-bare", "block-2-loaded", "block-3-held-out", "acceptance"]
+    assert [name for name, speed, _ in made if speed == 1.0] == expected
 
 
 def test_a_second_terminal_learns_that_the_bus_is_taken(
     tmp_path: Path, made_session: MadeSession
 ) -> None:
-    rig = made_session_rig(tmp_path / "cell", made_session)
+    folder = tmp_path / "cell"
+    rig = made_session_rig(folder, made_session)
     with bus_lock(rig.cell, rig.folder), pytest.raises(BusTaken, match="one at a time"):
         run_session(rig)
     assert rig.sessions == ()
@@ -560,7 +601,8 @@ def test_a_second_terminal_learns_that_the_bus_is_taken(
 def test_the_target_is_in_the_cell_file_and_no_log_depends_on_it(
     tmp_path: Path, made_session: MadeSession
 ) -> None:
-    rig = made_session_rig(tmp_path / "cell", made_session)
+    folder = tmp_path / "cell"
+    rig = made_session_rig(folder, made_session)
     before = rig.cell
     assert before.target_sigma_percent == 0.5
     document = json.loads(rig.cell_file.read_text())
@@ -588,19 +630,24 @@ def test_job_session_and_demonstration_take_the_same_stages(
 
     for module in (job, guided_session, demo):
         monkeypatch.setattr(module, "run_stages", noting)
+    folder = tmp_path / "job"
     with pytest.raises(JobHeld):
-        made_session_rig(tmp_path / "job", made_session).job()
+        made_session_rig(folder, made_session).job()
+    session_folder = tmp_path / "session"
     with pytest.raises(JobHeld):
-        run_session(made_session_rig(tmp_path / "session", made_session))
+        run_session(made_session_rig(session_folder, made_session))
     cell_file = shipped_configurations() / "cells" / "demo.yaml"
     out = tmp_path / "demo"
     out.mkdir()
-    settings = demo.Settings(out, tmp_path / "not-read.yaml", 1, 10.0)
+    simulation = tmp_path / "not-read.yaml"
+    settings = demo.Settings(out, simulation, 1, 10.0)
     reporter = demo.ProgressReporter(lambda _: None, lambda *_: None)
+    demo_stages = demo.DemoStages(settings, load_cell(cell_file), lambda: BEGAN, reporter)
     with pytest.raises(JobHeld):
-        demo.DemoStages(settings, load_cell(cell_file), lambda: BEGAN, reporter).run(cell_file)
+        demo_stages.run(cell_file)
     of_job, of_session, of_demo = taken
-    assert [type(stage) for stage in of_demo] == [Record, Identify, WatchDrift, Decide]
+    expected = [Record, Identify, WatchDrift, Decide]
+    assert [type(stage) for stage in of_demo] == expected
     assert of_demo is TO_DECISION
     assert of_job[:-1] == of_demo
     assert of_session[:-2] == of_demo
@@ -639,7 +686,8 @@ def aimed_rig(folder: Path, made: MadeSession, planned: list[dict[str, Any]]) ->
             recorded: Recorded = tools.record(request, **further)
             return recorded
         # The same content, which the calibration that was made names as its source.
-        request.out.write_bytes(request.out.with_name(f"{name}.mcap").read_bytes())
+        content = request.out.with_name(f"{name}.mcap").read_bytes()
+        request.out.write_bytes(content)
         return replace(made.recorded[name], path=request.out)
 
     rig.tools = replace(tools, plan=plan_later, record=record_later, preview=save_preview)
@@ -652,8 +700,10 @@ def aimed_session(
 ) -> tuple[Rig, list[dict[str, Any]], Conclusion]:
     """A session of five blocks, at whose end the time is up."""
     planned: list[dict[str, Any]] = []
-    rig = aimed_rig(tmp_path_factory.mktemp("aimed") / "cell", made_session, planned)
-    ended = run_session(rig, target_percent=0.05, time_limit_min=5 * BLOCK_S / 60.0)
+    folder = tmp_path_factory.mktemp("aimed") / "cell"
+    rig = aimed_rig(folder, made_session, planned)
+    time_limit_min = 5 * BLOCK_S / 60.0
+    ended = run_session(rig, target_percent=0.05, time_limit_min=time_limit_min)
     return rig, planned, ended
 
 
@@ -663,7 +713,8 @@ def test_from_the_fourth_block_on_moves_are_for_the_worst_gain(
     rig, planned, _ = aimed_session
     state = state_of(rig)
     assert [block.name for block in state.blocks][3:] == ["block-4-loaded", "block-5-bare"]
-    assert [further["experiment"].mounted for further in planned] == [(0,), (None,)]
+    expected = [(0,), (None,)]
+    assert [further["experiment"].mounted for further in planned] == expected
     for further in planned:
         goal = further["goal"]
         design = further["experiment"].design
@@ -676,7 +727,8 @@ def test_from_the_fourth_block_on_moves_are_for_the_worst_gain(
     assert (
         f"Planned for the gain that is farthest from its target after 3 blocks: {worst.axis},"
     ) in page
-    assert "Planned for" not in (rig.session.folder / "plan-1.html").read_text()
+    plan_1_path = rig.session.folder / "plan-1.html"
+    assert "Planned for" not in plan_1_path.read_text()
     assert all(gain.cause for gain in state.gains)
 
 
@@ -684,15 +736,19 @@ def test_with_friction_by_payload_all_bare_blocks_come_before_the_payload(
     tmp_path: Path, made_session: MadeSession
 ) -> None:
     planned: list[dict[str, Any]] = []
-    rig = aimed_rig(tmp_path / "cell", made_session, planned)
-    document = json.loads(rig.cell_file.read_text(encoding="utf-8"))
+    folder = tmp_path / "cell"
+    rig = aimed_rig(folder, made_session, planned)
+    text = rig.cell_file.read_text(encoding="utf-8")
+    document = json.loads(text)
     rig.cell_file.write_text(
         json.dumps({**document, "friction_by_payload": True}), encoding="utf-8"
     )
     predicted_percent = max(made_session.plans[0].predicted_std_percent)
     # By the first plan two bare blocks are enough. This rig has no third block that is loaded.
+    time_limit_min = 20 * BLOCK_S / 60.0
+    target_percent = predicted_percent / 1.3
     with pytest.raises(KeyError, match="block-3-loaded"):
-        run_session(rig, target_percent=predicted_percent / 1.3, time_limit_min=20 * BLOCK_S / 60.0)
+        run_session(rig, target_percent=target_percent, time_limit_min=time_limit_min)
     state = state_of(rig)
     assert state.bare_first == 2
     assert [block.name for block in state.blocks] == [
@@ -712,13 +768,18 @@ def test_later_blocks_stay_where_the_accepted_ones_were(
         for number in (1, 2, 3, 4, 5)
     ]
     accepted = [move for one in plans[:3] for move in one.moves]
-    lower = np.min([move.target_rad for move in accepted], axis=0) - 2e-5
-    upper = np.max([move.target_rad for move in accepted], axis=0) + 2e-5
+    target_rad = [move.target_rad for move in accepted]
+    smallest_target_rad = np.min(target_rad, axis=0)
+    lower = smallest_target_rad - 2e-5
+    largest_target_rad = np.max([move.target_rad for move in accepted], axis=0)
+    upper = largest_target_rad + 2e-5
     for move in (move for one in plans[3:] for move in one.moves):
         assert (np.array(move.target_rad) >= lower).all()
         assert (np.array(move.target_rad) <= upper).all()
-        assert move.velocity <= max(other.velocity for other in accepted)
-        assert move.acceleration <= max(other.acceleration for other in accepted)
+        largest_velocity = max(other.velocity for other in accepted)
+        assert move.velocity <= largest_velocity
+        largest_acceleration = max(other.acceleration for other in accepted)
+        assert move.acceleration <= largest_acceleration
 
 
 def test_at_the_time_limit_it_says_what_is_missing_and_what_would_help(
@@ -730,16 +791,17 @@ def test_at_the_time_limit_it_says_what_is_missing_and_what_would_help(
     assert "the target is 0.05 %" in state.missing
     more_time, *by_axis = state.would_help
     assert "--time-limit" in more_time
-    assert [line.split(":")[0] for line in by_axis] == [gain.axis for gain in state.gains]
-    assert [event["would_help"] for event in rig.events if event["event"] == "time is up"] == [
-        list(state.would_help)
-    ]
+    expected = [gain.axis for gain in state.gains]
+    assert [line.split(":")[0] for line in by_axis] == expected
+    would_helps = [event["would_help"] for event in rig.events if event["event"] == "time is up"]
+    assert would_helps == [list(state.would_help)]
     said = ending(ended, rig.cell_file)
     assert "What would help:" in said
     assert more_time in said
     # σ falls as 1/√time of the blocks that are in the fit.
     worst = max(gain.std_percent / gain.target_percent for gain in state.gains)
-    assert state.progress[-1].fitted_s == 4 * BLOCK_S
+    fitted_s = state.progress[-1].fitted_s
+    assert fitted_s == 4 * BLOCK_S
     needed_s = 5 * BLOCK_S + 4 * BLOCK_S * (worst**2 - 1.0)
     assert f"--time-limit {math.ceil(needed_s / 60.0)})" in more_time
 
@@ -748,22 +810,27 @@ def test_a_damaged_plan_for_the_worst_gain_is_made_again_in_the_same_room(
     tmp_path: Path, made_session: MadeSession
 ) -> None:
     planned: list[dict[str, Any]] = []
-    rig = aimed_rig(tmp_path / "cell", made_session, planned)
+    folder = tmp_path / "cell"
+    rig = aimed_rig(folder, made_session, planned)
 
     def stop_before(payload: str | None) -> None:
-        if len(rig.session.state.runs) == len(FIRST_BLOCKS):
+        runs = rig.session.state.runs
+        if len(runs) == len(FIRST_BLOCKS):
             raise KeyboardInterrupt
 
     limits: dict[str, Any] = {"target_percent": 0.05, "time_limit_min": 4 * BLOCK_S / 60.0}
+    operator = given_answers(rig, put=stop_before)
     with pytest.raises(KeyboardInterrupt):
-        run_session(rig, given_answers(rig, put=stop_before), **limits)
+        run_session(rig, operator, **limits)
     (rig.session.folder / "plan-4.yaml").write_text("damaged")
     rig.clock.go_on(minutes=5)
     run_session(rig, **limits)
     aimed, again = planned
     assert "goal" in aimed
     assert "goal" not in again
-    assert again["box"].lower.tolist() == aimed["box"].lower.tolist()
+    lower = again["box"].lower.tolist()
+    expected = aimed["box"].lower.tolist()
+    assert lower == expected
     assert again["speed"] == aimed["speed"]
 
 
@@ -812,22 +879,27 @@ class Scale:
 def test_a_block_with_the_wrong_body_is_recorded_again_and_kept(
     tmp_path: Path, made_session: MadeSession, bodies: tuple[float, ...], looked: str, said: str
 ) -> None:
-    rig = made_session_rig(tmp_path / "cell", made_session)
+    folder = tmp_path / "cell"
+    rig = made_session_rig(folder, made_session)
     scale = Scale(rig, *bodies)
     rig.tools = replace(rig.tools, look=scale)
     assert run_session(rig).outcome is Outcome.APPLIED
     assert "".join(name.split("-")[1] for name in scale.looked) == looked
     mistakes = [event["text"] for event in rig.events if event["event"] == "mistake in a block"]
-    assert [said in text for text in mistakes] == [True] * bool(said)
+    expected = [True] * bool(said)
+    assert [said in text for text in mistakes] == expected
     kept = list(rig.session.folder.glob("*-aside-*.mcap"))
-    assert len(kept) == len(looked) - len(FIRST_BLOCKS)
-    assert len(state_of(rig).runs) == len(FIRST_BLOCKS)
+    looked_count_expected = len(looked) - len(FIRST_BLOCKS)
+    assert len(kept) == looked_count_expected
+    runs = state_of(rig).runs
+    assert len(runs) == len(FIRST_BLOCKS)
 
 
 def test_a_body_that_was_there_from_the_beginning_costs_every_block(
     tmp_path: Path, made_session: MadeSession
 ) -> None:
-    rig = made_session_rig(tmp_path / "cell", made_session)
+    folder = tmp_path / "cell"
+    rig = made_session_rig(folder, made_session)
     scale = Scale(rig, 4.6, 4.6, 4.6, 0.0, 4.6, 4.6)
     rig.tools = replace(rig.tools, look=scale)
     assert run_session(rig).outcome is Outcome.APPLIED
@@ -845,16 +917,19 @@ def test_bare_blocks_are_compared_before_any_payload_was_weighed(
     tmp_path: Path, made_session: MadeSession
 ) -> None:
     """With `friction_by_payload`, several bare blocks come first."""
-    rig = made_session_rig(tmp_path / "cell", made_session)
+    folder = tmp_path / "cell"
+    rig = made_session_rig(folder, made_session)
     blocks = [
         Block(name=f"block-{number}-bare", payload=None, mass_kg=None, holdout=False, plan="")
         for number in (1, 2, 3)
     ]
-    left_on = mistake_in(rig.cell, PAYLOAD, blocks, BlockFacts(added_kg=4.4, added_std_kg=0.05))
+    facts = BlockFacts(added_kg=4.4, added_std_kg=0.05)
+    left_on = mistake_in(rig.cell, PAYLOAD, blocks, facts)
     assert left_on is not None
     assert left_on.blocks == ("block-3-bare",)
     assert "take DISC off" in left_on.text
-    was_there = mistake_in(rig.cell, PAYLOAD, blocks, BlockFacts(added_kg=-4.4, added_std_kg=0.05))
+    block_facts = BlockFacts(added_kg=-4.4, added_std_kg=0.05)
+    was_there = mistake_in(rig.cell, PAYLOAD, blocks, block_facts)
     assert was_there is not None
     assert was_there.blocks == ("block-1-bare", "block-2-bare", "block-3-bare")
     assert "4.4 kg less than in block-1-bare and block-2-bare" in was_there.text
@@ -863,7 +938,8 @@ def test_bare_blocks_are_compared_before_any_payload_was_weighed(
 def test_a_body_left_on_in_a_later_bare_block_is_noticed_there(
     tmp_path: Path, made_session: MadeSession
 ) -> None:
-    rig = made_session_rig(tmp_path / "cell", made_session)
+    folder = tmp_path / "cell"
+    rig = made_session_rig(folder, made_session)
     blocks = [
         Block(
             name=f"block-{n}",
@@ -875,13 +951,13 @@ def test_a_body_left_on_in_a_later_bare_block_is_noticed_there(
         for n, body in enumerate((None, "disc", "disc", None), 1)
     ]
     assert [block.name for block in compared_with(blocks)] == ["block-1"]
-    mistake = mistake_in(rig.cell, PAYLOAD, blocks, BlockFacts(added_kg=4.5, added_std_kg=0.05))
+    facts = BlockFacts(added_kg=4.5, added_std_kg=0.05)
+    mistake = mistake_in(rig.cell, PAYLOAD, blocks, facts)
     assert mistake is not None
     assert mistake.blocks == ("block-4",)
     assert "take DISC off" in mistake.text
-    assert (
-        mistake_in(rig.cell, PAYLOAD, blocks, BlockFacts(added_kg=0.3, added_std_kg=0.05)) is None
-    )
+    block_facts = BlockFacts(added_kg=0.3, added_std_kg=0.05)
+    assert mistake_in(rig.cell, PAYLOAD, blocks, block_facts) is None
     # A weighing that is too coarse tells nothing.
     assert mistake_in(rig.cell, PAYLOAD, blocks, BlockFacts(added_kg=4.5, added_std_kg=0.8)) is None
 
@@ -889,7 +965,8 @@ def test_a_body_left_on_in_a_later_bare_block_is_noticed_there(
 def test_a_body_that_was_turned_between_two_loaded_blocks_is_noticed(
     tmp_path: Path, made_session: MadeSession
 ) -> None:
-    rig = made_session_rig(tmp_path / "cell", made_session)
+    folder = tmp_path / "cell"
+    rig = made_session_rig(folder, made_session)
     blocks = [
         Block(
             name=f"block-{n}",
@@ -907,17 +984,19 @@ def test_a_body_that_was_turned_between_two_loaded_blocks_is_noticed(
     assert turned is not None
     assert turned.blocks == ("block-3",)
     assert "about 109 mm away" in turned.text
-    assert mistake_in(rig.cell, PAYLOAD, blocks, replace(same_mass, added_moment_kg_m=0.05)) is None
-    assert (
-        mistake_in(rig.cell, PAYLOAD, blocks, replace(same_mass, added_moment_std_kg_m=0.2)) is None
-    )
+    facts = replace(same_mass, added_moment_kg_m=0.05)
+    mistake = mistake_in(rig.cell, PAYLOAD, blocks, facts)
+    assert mistake is None
+    changed_same_mass = replace(same_mass, added_moment_std_kg_m=0.2)
+    assert mistake_in(rig.cell, PAYLOAD, blocks, changed_same_mass) is None
 
 
 def test_a_bare_block_that_is_recorded_again_is_weighed_beside_loaded_ones(
     tmp_path: Path, made_session: MadeSession
 ) -> None:
     """The log of the first block was damaged; nothing is wrong with the others."""
-    rig = made_session_rig(tmp_path / "cell", made_session)
+    folder = tmp_path / "cell"
+    rig = made_session_rig(folder, made_session)
     blocks = [
         Block(
             name=f"block-{n}",
@@ -929,11 +1008,11 @@ def test_a_bare_block_that_is_recorded_again_is_weighed_beside_loaded_ones(
         for n, body in ((2, "disc"), (3, "disc"), (1, None))
     ]
     assert [block.name for block in compared_with(blocks)] == ["block-2", "block-3"]
-    assert (
-        mistake_in(rig.cell, PAYLOAD, blocks, BlockFacts(added_kg=-MASS_KG, added_std_kg=0.05))
-        is None
-    )
-    still_on = mistake_in(rig.cell, PAYLOAD, blocks, BlockFacts(added_kg=0.1, added_std_kg=0.05))
+    facts = BlockFacts(added_kg=-MASS_KG, added_std_kg=0.05)
+    mistake = mistake_in(rig.cell, PAYLOAD, blocks, facts)
+    assert mistake is None
+    block_facts = BlockFacts(added_kg=0.1, added_std_kg=0.05)
+    still_on = mistake_in(rig.cell, PAYLOAD, blocks, block_facts)
     assert still_on is not None
     assert still_on.blocks == ("block-1",)
     assert still_on.text.endswith("take DISC off.")
@@ -942,9 +1021,12 @@ def test_a_bare_block_that_is_recorded_again_is_weighed_beside_loaded_ones(
 def test_a_session_goes_on_with_its_own_payload_alone(
     tmp_path: Path, made_session: MadeSession
 ) -> None:
-    rig = made_session_rig(tmp_path / "cell", made_session)
-    document = json.loads(rig.cell_file.read_text(encoding="utf-8"))
-    other = {**document["payloads"][0], "name": "ring", "mounting": "ring-a"}
+    folder = tmp_path / "cell"
+    rig = made_session_rig(folder, made_session)
+    text = rig.cell_file.read_text(encoding="utf-8")
+    document = json.loads(text)
+    first_payload = document["payloads"][0]
+    other = {**first_payload, "name": "ring", "mounting": "ring-a"}
     rig.cell_file.write_text(
         json.dumps({**document, "payloads": [*document["payloads"], other]}), encoding="utf-8"
     )
@@ -953,8 +1035,9 @@ def test_a_session_goes_on_with_its_own_payload_alone(
         if len(rig.session.state.runs) == 2:
             raise KeyboardInterrupt
 
+    operator = given_answers(rig, put=stop_before_the_third)
     with pytest.raises(KeyboardInterrupt):
-        run_session(rig, given_answers(rig, put=stop_before_the_third))
+        run_session(rig, operator)
     rig.clock.go_on(minutes=5)
     with pytest.raises(
         ConfigurationInconsistent, match="found a session whose blocks carry 'disc'"
@@ -966,16 +1049,17 @@ def test_a_session_goes_on_with_its_own_payload_alone(
 def test_an_axis_at_its_current_limit_and_an_unreadable_log_are_mistakes(
     tmp_path: Path, made_session: MadeSession
 ) -> None:
-    rig = made_session_rig(tmp_path / "cell", made_session)
-    blocks = [Block(name="block-1-bare", payload=None, mass_kg=None, holdout=False, plan="")]
-    saturated = mistake_in(
-        rig.cell, PAYLOAD, blocks, BlockFacts(saturated_percent=(0.0, 0.0, 4.2, 0.0, 0.0, 0.0))
-    )
+    folder = tmp_path / "cell"
+    rig = made_session_rig(folder, made_session)
+    block = Block(name="block-1-bare", payload=None, mass_kg=None, holdout=False, plan="")
+    blocks = [block]
+    saturated_percent = (0.0, 0.0, 4.2, 0.0, 0.0, 0.0)
+    facts = BlockFacts(saturated_percent=saturated_percent)
+    saturated = mistake_in(rig.cell, PAYLOAD, blocks, facts)
     assert saturated is not None
     assert "J3 was at its current limit for 4.2 %" in saturated.text
-    unreadable = mistake_in(
-        rig.cell, PAYLOAD, blocks, BlockFacts(unreadable="a jump of 3 rad: see to the encoder")
-    )
+    block_facts = BlockFacts(unreadable="a jump of 3 rad: see to the encoder")
+    unreadable = mistake_in(rig.cell, PAYLOAD, blocks, block_facts)
     assert unreadable is not None
     assert "see to the encoder" in unreadable.text
 
@@ -983,7 +1067,8 @@ def test_an_axis_at_its_current_limit_and_an_unreadable_log_are_mistakes(
 def test_a_mistake_that_stays_ends_the_session_with_what_to_do(
     tmp_path: Path, made_session: MadeSession
 ) -> None:
-    rig = made_session_rig(tmp_path / "cell", made_session)
+    folder = tmp_path / "cell"
+    rig = made_session_rig(folder, made_session)
     rig.tools = replace(rig.tools, look=lambda *_: BlockFacts(unreadable="no encoder: see to it"))
     with pytest.raises(JobHeld, match="a mistake in 4 recordings"):
         run_session(rig)
@@ -994,11 +1079,13 @@ def test_a_mistake_that_stays_ends_the_session_with_what_to_do(
 def test_a_person_may_keep_a_block_with_a_mistake(
     tmp_path: Path, made_session: MadeSession, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    rig = made_session_rig(tmp_path / "cell", made_session)
+    folder = tmp_path / "cell"
+    rig = made_session_rig(folder, made_session)
     scale = Scale(rig, 0.0, 1.7, 1.7)
     rig.tools = replace(rig.tools, look=scale)
     typed = "\n\n" + "4.59\n4.59\n\n\n" + "keep\n" + "\n\n" + "yes\n" + "\n\n"
-    assert run_session(rig, person(rig, monkeypatch, typed)).outcome is Outcome.APPLIED
+    operator = person(rig, monkeypatch, typed)
+    assert run_session(rig, operator).outcome is Outcome.APPLIED
     assert len(scale.looked) == len(FIRST_BLOCKS)
 
 
@@ -1018,23 +1105,27 @@ def test_the_moves_show_what_is_on_the_flange(whole_session: tuple[Rig, MadeSess
     assert again.added_moment_kg_m < 0.02 * MASS_KG
     assert first.added_moment_kg_m > 0.05 * MASS_KG
     assert exchanged.added_kg == pytest.approx(-MASS_KG, rel=0.1)
-    assert look_at_block(rig.cell, bare, []).added_kg is None
+    look = look_at_block(rig.cell, bare, [])
+    assert look.added_kg is None
     assert first.unreadable == ""
 
 
 def test_a_cell_file_that_changes_between_blocks_is_refused_with_the_way_out(
     tmp_path: Path, made_session: MadeSession
 ) -> None:
-    rig = made_session_rig(tmp_path / "cell", made_session)
+    folder = tmp_path / "cell"
+    rig = made_session_rig(folder, made_session)
     before = rig.cell_file.read_bytes()
 
     def put(payload: str | None) -> None:
         rig.cell_file.write_bytes(before + b"\n# looked at\n")
 
+    operator = given_answers(rig, put=put)
     with pytest.raises(ConfigurationInconsistent, match="put the old content back") as caught:
-        run_session(rig, given_answers(rig, put=put))
+        run_session(rig, operator)
     assert "residual" not in str(caught.value)  # no block with the payload yet
-    assert [run.name for run in rig.session.state.runs] == ["block-1-bare"]
+    runs = rig.session.state.runs
+    assert [run.name for run in runs] == ["block-1-bare"]
     rig.cell_file.write_bytes(before)
     assert run_session(rig).outcome is Outcome.APPLIED
     assert rig.session.state.attempt == 2
@@ -1043,7 +1134,8 @@ def test_a_cell_file_that_changes_between_blocks_is_refused_with_the_way_out(
 def test_blocks_of_a_session_whose_cell_file_was_corrected_are_not_lost(
     tmp_path: Path, made_session: MadeSession
 ) -> None:
-    rig = made_session_rig(tmp_path / "cell", made_session)
+    cell_folder = tmp_path / "cell"
+    rig = made_session_rig(cell_folder, made_session)
     before = rig.cell_file.read_bytes()
     mounted = count(1)
 
@@ -1051,8 +1143,9 @@ def test_blocks_of_a_session_whose_cell_file_was_corrected_are_not_lost(
         if next(mounted) == 2:
             rig.cell_file.write_bytes(before + b"\n# looked at\n")
 
+    operator = given_answers(rig, put=put)
     with pytest.raises(ConfigurationInconsistent) as caught:
-        run_session(rig, given_answers(rig, put=put))
+        run_session(rig, operator)
     folder = rig.session.folder
     command = (
         f"`drivegain residual {folder}/block-1-bare.mcap {folder}/block-2-loaded.mcap --cell "
@@ -1075,7 +1168,8 @@ def test_blocks_of_a_session_whose_cell_file_was_corrected_are_not_lost(
 
 
 def test_what_the_fit_says_to_check_is_to_do(tmp_path: Path, made_session: MadeSession) -> None:
-    rig = made_session_rig(tmp_path / "cell", made_session)
+    folder = tmp_path / "cell"
+    rig = made_session_rig(folder, made_session)
     late = Diagnosis(
         "current-late",
         (),
@@ -1104,7 +1198,8 @@ def test_a_wrong_description_is_to_be_corrected_before_anything_is_applied(
     is_mended: bool,
 ) -> None:
     """Where two corrections are alike, none is to be made, and no blocks are fitted with it."""
-    rig = made_session_rig(tmp_path / "cell", made_session)
+    folder = tmp_path / "cell"
+    rig = made_session_rig(folder, made_session)
     ended = run_session(rig)
     wrong = Diagnosis(
         name, (), ("J2",), "the zero of J2 off by 2°", "that of the URDF", "see to J2"
@@ -1129,19 +1224,23 @@ TURNED = Diagnosis(
 def test_a_wrong_geometry_ends_the_session_before_a_payload_is_blamed(
     tmp_path: Path, made_session: MadeSession
 ) -> None:
-    rig = made_session_rig(tmp_path / "cell", made_session)
+    folder = tmp_path / "cell"
+    rig = made_session_rig(folder, made_session)
     judged: list[list[str]] = []
 
     def geometry(cell: Cell, logs: Sequence[Path]) -> Diagnosis | None:
         judged.append([log.stem for log in logs])
         return TURNED
 
-    rig.tools = replace(rig.tools, look=Scale(rig, 0.0, 0.1), geometry=geometry)
+    look = Scale(rig, 0.0, 0.1)
+    rig.tools = replace(rig.tools, look=look, geometry=geometry)
     with pytest.raises(GeometryTurned, match="the mounting: found gravity along") as caught:
         run_session(rig)
     assert judged == [["block-1-bare", "block-2-loaded"]]
-    assert not [event for event in rig.events if event["event"] == "mistake in a block"]
-    assert [run.name for run in rig.session.state.runs] == ["block-1-bare", "block-2-loaded"]
+    events = [event for event in rig.events if event["event"] == "mistake in a block"]
+    assert not events
+    runs = rig.session.state.runs
+    assert [run.name for run in runs] == ["block-1-bare", "block-2-loaded"]
     kept, hint = caught.value.__notes__
     assert kept == "kept: block-1-bare, block-2-loaded"
     assert hint.startswith("hint: correct the cell file; `drivegain residual")
@@ -1151,19 +1250,22 @@ def test_a_wrong_geometry_ends_the_session_before_a_payload_is_blamed(
 def test_a_wrong_geometry_of_the_fit_asks_for_no_further_block(
     tmp_path: Path, made_session: MadeSession
 ) -> None:
-    rig = made_session_rig(tmp_path / "cell", made_session)
+    folder = tmp_path / "cell"
+    rig = made_session_rig(folder, made_session)
     turned = replace(made_session.fitted, diagnoses=(TURNED,))
     rig.tools = replace(rig.tools, fit=lambda logs, *, holdout: turned)
     with pytest.raises(GeometryTurned, match="the mounting: found gravity along"):
         run_session(rig)
-    assert len(rig.session.state.runs) == len(FIRST_BLOCKS)
+    runs = rig.session.state.runs
+    assert len(runs) == len(FIRST_BLOCKS)
     assert rig.session.state.outcome is Outcome.UNFIT
 
 
 def test_exchanged_currents_ask_for_no_further_block(
     tmp_path: Path, made_session: MadeSession
 ) -> None:
-    rig = made_session_rig(tmp_path / "cell", made_session)
+    folder = tmp_path / "cell"
+    rig = made_session_rig(folder, made_session)
 
     def refused(logs: Sequence[Path], *, holdout: Sequence[Path]) -> Fit:
         raise ChannelsExchanged(
@@ -1173,9 +1275,11 @@ def test_exchanged_currents_ask_for_no_further_block(
     rig.tools = replace(rig.tools, fit=refused)
     with pytest.raises(ChannelsExchanged) as caught:
         run_session(rig)
-    assert len(rig.session.state.runs) == len(FIRST_BLOCKS)
+    runs = rig.session.state.runs
+    assert len(runs) == len(FIRST_BLOCKS)
     next_step = "correct the wiring or the cell file; the same command then begins a new session"
-    assert caught.value.__notes__[-1] == f"hint: {next_step}"
+    last_note = caught.value.__notes__[-1]
+    assert last_note == f"hint: {next_step}"
     first = rig.session.folder
     assert next_step in (first / SUMMARY_TEXT).read_text()
     # The wiring was corrected, and the cell file is what it was: other blocks are recorded.
@@ -1192,7 +1296,8 @@ def test_gravity_that_is_described_wrongly_is_found_in_two_blocks(
     logs = [made.logs["block-1-bare"], made.logs["block-2-loaded"]]
     assert look_at_geometry(rig.cell, logs) is None
     x, y, z = rig.cell.gravity_m_s2
-    on_the_wall = replace(rig.cell, gravity_m_s2=(z, y, x))
+    gravity_m_s2 = (z, y, x)
+    on_the_wall = replace(rig.cell, gravity_m_s2=gravity_m_s2)
     found = look_at_geometry(on_the_wall, logs)
     assert found is not None
     assert found.name == "gravity-turned"
@@ -1201,7 +1306,8 @@ def test_gravity_that_is_described_wrongly_is_found_in_two_blocks(
 def test_a_log_that_is_damaged_before_the_end_is_recorded_again_in_its_place(
     tmp_path: Path, made_session: MadeSession
 ) -> None:
-    rig = made_session_rig(tmp_path / "cell", made_session)
+    folder = tmp_path / "cell"
+    rig = made_session_rig(folder, made_session)
     tools = rig.tools
 
     def interrupted(*_: object, **__: object) -> Any:
@@ -1213,12 +1319,14 @@ def test_a_log_that_is_damaged_before_the_end_is_recorded_again_in_its_place(
     (rig.session.folder / "block-2-loaded.mcap").write_bytes(b"damaged")
     rig.tools = tools
     assert run_session(rig).outcome is Outcome.APPLIED
-    assert [block.name for block in state_of(rig).blocks] == [
+    blocks = state_of(rig).blocks
+    assert [block.name for block in blocks] == [
         "block-1-bare",
         "block-2-loaded",
         "block-3-held-out",
     ]
-    assert [run.name for run in state_of(rig).runs] == [
+    runs = state_of(rig).runs
+    assert [run.name for run in runs] == [
         "block-1-bare",
         "block-3-held-out",
         "block-2-loaded",
@@ -1240,16 +1348,20 @@ def test_a_person_who_answers_every_prompt_calibrates(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    rig = made_session_rig(tmp_path / "cell", made_session)
+    folder = tmp_path / "cell"
+    rig = made_session_rig(folder, made_session)
     bare = "\n\n"
     weighed = "4.59\n4,59\n"
     typed = bare + weighed + "\n\n" + "\n\n" + "yes\n" + "\n\n"
-    assert run_session(rig, person(rig, monkeypatch, typed)).outcome is Outcome.APPLIED
+    operator = person(rig, monkeypatch, typed)
+    assert run_session(rig, operator).outcome is Outcome.APPLIED
     assert sys.stdin.read() == ""
     said = capsys.readouterr().err
     assert "NOTHING on the flange" in said
     assert "DISC (4.59 kg)" in said
-    assert {block.mass_kg for block in state_of(rig).blocks} == {None, MASS_KG}
+    blocks = state_of(rig).blocks
+    mass_kg = {block.mass_kg for block in blocks}
+    assert mass_kg == {None, MASS_KG}
     applied = next(entry for entry in rig.audit if entry.action is AuditAction.APPLIED)
     assert applied.who == "a person"
 
@@ -1262,10 +1374,13 @@ def test_yes_in_either_case_writes_and_a_slip_is_asked_again(
     capsys: pytest.CaptureFixture[str],
     answer: str,
 ) -> None:
-    rig = made_session_rig(tmp_path / "cell", made_session)
+    folder = tmp_path / "cell"
+    rig = made_session_rig(folder, made_session)
     typed = "\n\n" + "4.59\n4.59\n" + "\n\n" * 2 + f"{answer}\n" + "\n\n"
-    assert run_session(rig, person(rig, monkeypatch, typed)).outcome is Outcome.APPLIED
-    assert ("Found 'y', expected yes, or Enter alone." in capsys.readouterr().err) == (
+    operator = person(rig, monkeypatch, typed)
+    assert run_session(rig, operator).outcome is Outcome.APPLIED
+    error_output = capsys.readouterr().err
+    assert ("Found 'y', expected yes, or Enter alone." in error_output) == (
         answer.startswith("y\n")
     )
 
@@ -1274,9 +1389,11 @@ def test_yes_in_either_case_writes_and_a_slip_is_asked_again(
 def test_anything_but_yes_leaves_the_controller(
     tmp_path: Path, made_session: MadeSession, monkeypatch: pytest.MonkeyPatch, answer: str
 ) -> None:
-    rig = made_session_rig(tmp_path / "cell", made_session)
+    folder = tmp_path / "cell"
+    rig = made_session_rig(folder, made_session)
     typed = "\n\n" + "4.59\n4.59\n" + "\n\n" * 2 + f"{answer}\n"
-    ended = run_session(rig, person(rig, monkeypatch, typed))
+    operator = person(rig, monkeypatch, typed)
+    ended = run_session(rig, operator)
     assert ended.outcome is Outcome.PROPOSED
 
 
@@ -1290,7 +1407,8 @@ def test_keep_in_either_case_keeps_a_block(
     typed: str,
     is_again: bool,
 ) -> None:
-    rig = made_session_rig(tmp_path / "cell", made_session)
+    folder = tmp_path / "cell"
+    rig = made_session_rig(folder, made_session)
     run = PlannedRun(name="bare-1", plan_file=Path("plan-1.yaml"))
     operator = person(rig, monkeypatch, typed)
     assert operator.record_again(run, ["bare-1"], "a mistake") == is_again
@@ -1303,10 +1421,12 @@ def test_the_mass_is_asked_again_until_it_is_the_same_twice(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    rig = made_session_rig(tmp_path / "cell", made_session)
+    folder = tmp_path / "cell"
+    rig = made_session_rig(folder, made_session)
     typed = "4.59\n4.95\n" + "x\nx\n" + "4.59\n4.59\n"
     assert person(rig, monkeypatch, typed).weigh("disc") == MASS_KG
-    assert capsys.readouterr().err.count("two different numbers, or none") == 2
+    error_output = capsys.readouterr().err
+    assert error_output.count("two different numbers, or none") == 2
 
 
 @pytest.mark.parametrize(
@@ -1321,7 +1441,8 @@ def test_a_mass_in_grams_or_of_another_body_is_not_taken(
     typed: str,
     expected: str,
 ) -> None:
-    rig = made_session_rig(tmp_path / "cell", made_session)
+    folder = tmp_path / "cell"
+    rig = made_session_rig(folder, made_session)
     assert person(rig, monkeypatch, typed + "4.59\n4.59\n").weigh("disc") == MASS_KG
     assert expected in capsys.readouterr().err
 
@@ -1329,17 +1450,21 @@ def test_a_mass_in_grams_or_of_another_body_is_not_taken(
 def test_input_that_ends_ends_the_session_where_it_is(
     tmp_path: Path, made_session: MadeSession, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    rig = made_session_rig(tmp_path / "cell", made_session)
+    folder = tmp_path / "cell"
+    rig = made_session_rig(folder, made_session)
+    operator = person(rig, monkeypatch, "\n\n4.59\n")
     with pytest.raises(JobHeld, match="the input has ended"):
-        run_session(rig, person(rig, monkeypatch, "\n\n4.59\n"))
-    assert [run.name for run in rig.session.state.runs] == ["block-1-bare"]
+        run_session(rig, operator)
+    runs = rig.session.state.runs
+    assert [run.name for run in runs] == ["block-1-bare"]
     assert run_session(rig).outcome is Outcome.APPLIED
 
 
 def test_each_block_asks_before_power_comes_on(
     tmp_path: Path, made_session: MadeSession, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    rig = made_session_rig(tmp_path / "cell", made_session)
+    folder = tmp_path / "cell"
+    rig = made_session_rig(folder, made_session)
     block = PlannedRun(name="block-1-bare", plan_file=Path("plan-1.yaml"))
     without_enter = person(rig, monkeypatch, "")
     with pytest.raises(JobHeld, match="robot moves now"):
@@ -1353,7 +1478,8 @@ def test_each_block_asks_before_power_comes_on(
 def test_the_verb_moves_nothing_without_enable_motion(
     tmp_path: Path, made_session: MadeSession, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    rig = made_session_rig(tmp_path / "cell", made_session)
+    folder = tmp_path / "cell"
+    rig = made_session_rig(folder, made_session)
     assert main(["calibrate", str(rig.cell_file)]) == ExitCode.USAGE
     assert "--enable-motion" in capsys.readouterr().err
     assert rig.sessions == ()
@@ -1362,7 +1488,8 @@ def test_the_verb_moves_nothing_without_enable_motion(
 def test_yes_move_is_for_simulated_cells(
     tmp_path: Path, made_session: MadeSession, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    rig = made_session_rig(tmp_path / "cell", made_session)
+    folder = tmp_path / "cell"
+    rig = made_session_rig(folder, made_session)
     document = json.loads(rig.cell_file.read_text())
     document["bus"] = {"interface": "socketcan", "channel": "can7", "bitrate_bit_s": 1_000_000}
     document["sync"]["pacing"] = "timed"
@@ -1392,7 +1519,8 @@ def _quick_planner(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_check_says_what_is_there_and_what_a_first_session_can_show(
     tmp_path: Path, made_session: MadeSession, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    rig = made_session_rig(tmp_path / "cell", made_session, min_free_mb=1)
+    folder = tmp_path / "cell"
+    rig = made_session_rig(folder, made_session, min_free_mb=1)
     arguments = ["calibrate", str(rig.cell_file), "--check", "--block", "8"]
     with serving(rig):
         assert main(arguments) == ExitCode.OK
@@ -1412,7 +1540,8 @@ def test_check_says_what_is_there_and_what_a_first_session_can_show(
 def test_check_of_a_payload_that_the_cell_lacks_is_a_line_of_the_table(
     tmp_path: Path, made_session: MadeSession, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    rig = made_session_rig(tmp_path / "cell", made_session, min_free_mb=1)
+    folder = tmp_path / "cell"
+    rig = made_session_rig(folder, made_session, min_free_mb=1)
     arguments = ["calibrate", str(rig.cell_file), "--check", "--block", "8", "--payload", "anvil"]
     with serving(rig):
         assert main(arguments) == ExitCode.CONFIGURATION

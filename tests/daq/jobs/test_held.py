@@ -59,13 +59,16 @@ def held(rig: Rig, kind: type[Exception], code: int) -> Exception:
     assert exit_code(kind) == code
     assert rig.session.state.outcome is Outcome.STOPPED
     assert rig.session.state.exit_code == code
-    assert rig.audit[-1].action is AuditAction.RECALIBRATION_ENDED
-    assert rig.audit[-1].details["exit_code"] == code
+    action = rig.audit[-1].action
+    assert action is AuditAction.RECALIBRATION_ENDED
+    details = rig.audit[-1].details
+    assert details["exit_code"] == code
     return caught.value
 
 
 def test_an_interlock_that_says_no_lets_nothing_begin(tmp_path: Path, made: Made) -> None:
-    rig = made_rig(tmp_path / "cell", made)
+    folder = tmp_path / "cell"
+    rig = made_rig(folder, made)
     rig.closed.unlink()
     asked = []
     rig.tools = replace(rig.tools, drives=lambda *_: asked.append("drives"))
@@ -82,13 +85,15 @@ def test_a_cell_that_was_renamed_or_has_the_history_of_another_robot_is_held(
     tmp_path: Path, made: Made
 ) -> None:
     """Nothing has moved, and the message says the name, or the drive."""
-    rig = made_rig(tmp_path / "cell", made)
+    folder = tmp_path / "cell"
+    rig = made_rig(folder, made)
     asked = []
     rig.tools = replace(rig.tools, drives=lambda *_: asked.append("drives"))
     robot = calibrated_robot(rig.cell)
     ledger = Ledger.of(rig.cell)
     assert ledger is not None
-    drives = (replace(robot.drives[0], product_code=1), *robot.drives[1:])
+    changed_drive = replace(robot.drives[0], product_code=1)
+    drives = (changed_drive, *robot.drives[1:])
     other = replace(calibration_of(0), robot=replace(robot, drives=drives))
     details = {
         "sha256": digest_of(other),
@@ -125,13 +130,16 @@ def test_an_interlock_that_opens_between_two_runs_ends_the_job_there(
     left_open = {
         "command": ["sh", "-c", 'echo "$1" > mounted; test "$1" = none || rm -f closed', "mount"]
     }
-    rig = make_rig(tmp_path / "cell", one_move, mount=left_open)
+    folder = tmp_path / "cell"
+    rig = make_rig(folder, one_move, mount=left_open)
     with serving(rig) as cell:
         held(rig, NotReleased, ExitCode.NOT_RELEASED)
         assert powerless(cell)
         moved_s = cell.plant.time_s
-    assert [run.name for run in rig.session.state.runs] == ["bare-1"]
-    assert not (rig.session.folder / "loaded-1.mcap.part").exists()
+    runs = rig.session.state.runs
+    assert [run.name for run in runs] == ["bare-1"]
+    loaded_1_path = rig.session.folder / "loaded-1.mcap.part"
+    assert not loaded_1_path.exists()
     assert moved_s < 10.0
 
 
@@ -142,7 +150,8 @@ def test_a_door_that_opens_while_the_drives_are_prepared_keeps_them_without_powe
     """Preflight and the recorder's begin have seen it closed;
     the last question comes when only the motion is left.
     """
-    rig = make_rig(tmp_path / "cell", one_move, warm_up_min=warm_up_min)
+    cell_folder = tmp_path / "cell"
+    rig = make_rig(cell_folder, one_move, warm_up_min=warm_up_min)
     cycles: list[int] = []
     with serving(rig) as cell:
 
@@ -156,27 +165,33 @@ def test_a_door_that_opens_while_the_drives_are_prepared_keeps_them_without_powe
 
         rig.tools = replace(rig.tools, run=asking)
         held(rig, NotReleased, ExitCode.NOT_RELEASED)
-        assert {node.drive.state for node in cell.nodes} == {PowerState.SWITCH_ON_DISABLED}
+        states = {node.drive.state for node in cell.nodes}
+        assert states == {PowerState.SWITCH_ON_DISABLED}
         assert cell.cycles == cycles[2]
     # By the third question the drives had been mapped and had answered a SYNC, and no move had been
     # made.
     assert len(cycles) == 3
-    assert 0 < cycles[2] - cycles[1] < 10
-    assert not list(rig.session.folder.glob("*.mcap*"))
+    cycle_difference = cycles[2] - cycles[1]
+    assert 0 < cycle_difference < 10
+    files = rig.session.folder.glob("*.mcap*")
+    assert not list(files)
 
 
 def test_a_payload_that_cannot_be_mounted_ends_the_job_and_the_next_goes_on_with_it(
     tmp_path: Path, made: Made
 ) -> None:
+    mount = {"command": ["sh", "-c", 'test "$1" = none -o -e changer', "mount"]}
+    folder = tmp_path / "cell"
     rig = made_rig(
-        tmp_path / "cell",
+        folder,
         made,
-        mount={"command": ["sh", "-c", 'test "$1" = none -o -e changer', "mount"]},
+        mount=mount,
     )
     error = held(rig, JobHeld, ExitCode.JOB_HELD)
     assert "mount command" in str(error)
     assert "disc" in str(error)
-    assert [run.name for run in rig.session.state.runs] == ["bare-1"]
+    runs = rig.session.state.runs
+    assert [run.name for run in runs] == ["bare-1"]
     first = rig.session.state.runs[0]
     (rig.cells / "changer").touch()
     recorded = []
@@ -194,7 +209,8 @@ def test_a_payload_that_cannot_be_mounted_ends_the_job_and_the_next_goes_on_with
 
 
 def test_two_jobs_at_once_are_one(tmp_path: Path, made: Made) -> None:
-    rig = made_rig(tmp_path / "cell", made)
+    folder = tmp_path / "cell"
+    rig = made_rig(folder, made)
     with bus_lock(rig.cell, rig.folder), pytest.raises(BusTaken, match="one at a time"):
         rig.job()
     assert rig.sessions == ()
@@ -205,10 +221,12 @@ def test_two_jobs_at_once_are_one(tmp_path: Path, made: Made) -> None:
 
 def test_the_lock_of_a_bus_ends_with_its_process(tmp_path: Path, made: Made) -> None:
     """A bus across processes; the other one is killed."""
-    rig = made_rig(tmp_path / "cell", made)
+    folder = tmp_path / "cell"
+    rig = made_rig(folder, made)
+    buses = tuple(replace(bus, interface="socketcan", channel="vcan9") for bus in rig.cell.buses)
     shared = replace(
         rig.cell,
-        buses=tuple(replace(bus, interface="socketcan", channel="vcan9") for bus in rig.cell.buses),
+        buses=buses,
     )
     read_end, signal_end = os.pipe()
     child = os.fork()
@@ -233,18 +251,21 @@ def test_the_lock_of_a_bus_ends_with_its_process(tmp_path: Path, made: Made) -> 
 def test_another_user_learns_that_a_bus_is_taken_whatever_our_umask_is(
     tmp_path: Path, made: Made
 ) -> None:
-    rig = made_rig(tmp_path / "cell", made)
+    folder = tmp_path / "cell"
+    rig = made_rig(folder, made)
     before = os.umask(0o077)
     try:
         with bus_lock(rig.cell, rig.folder):
             (lock,) = rig.folder.glob("*.lock")
-            assert lock.stat().st_mode & 0o777 == 0o644
+            st_mode = lock.stat().st_mode
+            assert st_mode & 0o777 == 0o644
     finally:
         os.umask(before)
 
 
 def test_a_lock_that_is_no_file_is_refused_at_once(tmp_path: Path, made: Made) -> None:
-    rig = made_rig(tmp_path / "cell", made)
+    folder = tmp_path / "cell"
+    rig = made_rig(folder, made)
     (bus,) = rig.cell.buses
     os.mkfifo(rig.folder / lock_name(bus))
     with pytest.raises(OutputFailed, match="no regular file"), bus_lock(rig.cell, rig.folder):
@@ -255,7 +276,8 @@ def test_a_lock_that_is_no_file_is_refused_at_once(tmp_path: Path, made: Made) -
 def test_a_hub_has_one_lock_whatever_it_is_called(
     tmp_path: Path, made: Made, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (bus,) = made_rig(tmp_path / "cell", made).cell.buses
+    folder = tmp_path / "cell"
+    (bus,) = made_rig(folder, made).cell.buses
     known = {
         "hub": ["fd00::7", "10.0.0.9", "10.0.0.7"],
         "hub.lan": ["10.0.0.7", "10.0.0.9"],
@@ -272,9 +294,8 @@ def test_a_hub_has_one_lock_whatever_it_is_called(
     monkeypatch.setattr(socket, "getaddrinfo", addresses)
 
     def name(host: str) -> str:
-        return lock_name(
-            replace(bus, interface="socketcand", channel="can0", host=host, port=29536)
-        )
+        changed_bus = replace(bus, interface="socketcand", channel="can0", host=host, port=29536)
+        return lock_name(changed_bus)
 
     assert name("hub") == name("hub.lan") == "drivegain-socketcand-can0-10.0.0.7-29536.lock"
     assert name("localhost") == name("127.0.0.1") == name("::1") != name("hub")
@@ -296,7 +317,8 @@ def test_a_hub_has_one_lock_whatever_it_is_called(
     ],
 )
 def test_this_machine_is_one_hub_by_all_its_names(host: str, tmp_path: Path, made: Made) -> None:
-    (bus,) = made_rig(tmp_path / "cell", made).cell.buses
+    folder = tmp_path / "cell"
+    (bus,) = made_rig(folder, made).cell.buses
     hub = replace(bus, interface="socketcand", channel="can0", host=host, port=29536)
     assert (
         lock_name(hub)
@@ -312,7 +334,8 @@ def test_this_machine_is_one_hub_by_all_its_names(host: str, tmp_path: Path, mad
 def test_an_address_of_a_hub_may_be_spelt_in_several_ways(
     one: str, other: str, tmp_path: Path, made: Made
 ) -> None:
-    (bus,) = made_rig(tmp_path / "cell", made).cell.buses
+    folder = tmp_path / "cell"
+    (bus,) = made_rig(folder, made).cell.buses
     names = [
         lock_name(replace(bus, interface="socketcand", channel="can0", host=host, port=29536))
         for host in (one, other, "10.0.0.8")
@@ -326,7 +349,8 @@ def test_a_hub_known_by_a_mapped_address_alone_is_that_of_its_ipv4_address(
     """As getaddrinfo answers where it maps;
     the IPv4 address goes before others as it does unmapped.
     """
-    (bus,) = made_rig(tmp_path / "cell", made).cell.buses
+    folder = tmp_path / "cell"
+    (bus,) = made_rig(folder, made).cell.buses
     known = {"hub": ["2001:db8::1", "::ffff:10.0.0.7"], "10.0.0.7": ["10.0.0.7"]}
 
     def addresses(host: str, port: int, **_: object) -> list[tuple[Any, ...]]:
@@ -341,7 +365,8 @@ def test_a_hub_known_by_a_mapped_address_alone_is_that_of_its_ipv4_address(
 
 
 def test_a_job_that_is_out_of_time_stops_the_axes(tmp_path: Path, one_move: Path) -> None:
-    rig = make_rig(tmp_path / "cell", one_move)
+    folder = tmp_path / "cell"
+    rig = make_rig(folder, one_move)
     powered = []
     with serving(rig) as cell:
 
@@ -377,7 +402,8 @@ def test_an_alarm_does_not_cut_a_stop_short() -> None:
 def test_a_service_manager_that_ends_the_job_ends_the_motion(
     tmp_path: Path, one_move: Path
 ) -> None:
-    rig = make_rig(tmp_path / "cell", one_move)
+    folder = tmp_path / "cell"
+    rig = make_rig(folder, one_move)
     asked = []
     with serving(rig) as cell:
 
@@ -395,13 +421,15 @@ def test_a_service_manager_that_ends_the_job_ends_the_motion(
     assert rig.controller.read_bytes() == before
     assert rig.session.state.outcome is Outcome.INTERRUPTED
     assert rig.session.state.exit_code == ExitCode.INTERRUPTED
-    assert rig.audit[-1].details["outcome"] == "interrupted"
+    details = rig.audit[-1].details
+    assert details["outcome"] == "interrupted"
 
 
 def test_a_disk_that_is_full_is_reported_before_and_during_a_run(
     tmp_path: Path, one_move: Path
 ) -> None:
-    rig = make_rig(tmp_path / "cell", one_move, min_free_mb=1000)
+    folder = tmp_path / "cell"
+    rig = make_rig(folder, one_move, min_free_mb=1000)
     rig.tools = replace(rig.tools, free=lambda _: 999 * 10**6)
     error = held(rig, DiskSpaceShort, ExitCode.UNEXPECTED)
     assert "min_free_mb" in str(error)
@@ -433,7 +461,8 @@ def not_counted(rig: Rig) -> list[str]:
 def test_a_job_under_a_later_date_does_not_hold_the_next_ones(
     tmp_path: Path, made: Made, days: int
 ) -> None:
-    rig = made_rig(tmp_path / "cell", made, policy=ANY_AGE, every_h=24)
+    folder = tmp_path / "cell"
+    rig = made_rig(folder, made, policy=ANY_AGE, every_h=24)
     rig.clock.at = BEGAN + timedelta(days=days)
     assert rig.job().outcome is Outcome.APPLIED
     wrong = rig.session
@@ -450,7 +479,9 @@ def test_a_job_under_a_later_date_does_not_hold_the_next_ones(
     compared = right.state.decision
     assert written is not None
     assert compared is not None
-    assert [gain.old_std for gain in compared.gains] == [gain.new_std for gain in written.gains]
+    expected = [gain.new_std for gain in written.gains]
+    old_stds = [gain.old_std for gain in compared.gains]
+    assert old_stds == expected
     assert right.folder.name.startswith("20260105T03")
     rig.clock.go_on(hours=12)
     ended = rig.job()
@@ -464,7 +495,8 @@ def test_a_job_under_a_later_date_does_not_hold_the_next_ones(
 def test_an_unfinished_session_under_a_later_date_is_not_continued(
     tmp_path: Path, made: Made
 ) -> None:
-    rig = made_rig(tmp_path / "cell", made, policy=ANY_AGE)
+    folder = tmp_path / "cell"
+    rig = made_rig(folder, made, policy=ANY_AGE)
     rig.clock.at = BEGAN + timedelta(days=730)
     rig.closed.unlink()
     with pytest.raises(NotReleased):
@@ -480,7 +512,8 @@ def test_an_unfinished_session_under_a_later_date_is_not_continued(
 def test_a_clock_that_went_back_is_said_and_the_next_session_is_one_of_its_own(
     tmp_path: Path, made: Made
 ) -> None:
-    rig = made_rig(tmp_path / "cell", made, policy=ANY_AGE, every_h=24)
+    folder = tmp_path / "cell"
+    rig = made_rig(folder, made, policy=ANY_AGE, every_h=24)
     assert rig.job().outcome is Outcome.APPLIED
     first = rig.session
     rig.clock.at = BEGAN - timedelta(days=3)
@@ -498,7 +531,8 @@ def test_a_clock_that_went_back_is_said_and_the_next_session_is_one_of_its_own(
 def test_a_clock_before_this_program_was_made_holds_the_job_and_says_what_to_set(
     tmp_path: Path, made: Made
 ) -> None:
-    rig = made_rig(tmp_path / "cell", made)
+    folder = tmp_path / "cell"
+    rig = made_rig(folder, made)
     assert rig.job().outcome is Outcome.APPLIED
     rig.clock.at = BEGAN - timedelta(days=730)
     with pytest.raises(JobHeld, match=r"found 2024-01-06.*set the clock \(`timedatectl`\)"):
@@ -511,7 +545,8 @@ def test_a_clock_before_this_program_was_made_holds_the_job_and_says_what_to_set
 def test_a_clock_that_steps_in_a_session_changes_no_age(
     tmp_path: Path, made: Made, days: int
 ) -> None:
-    rig = made_rig(tmp_path / "cell", made, policy=ANY_AGE, every_h=24)
+    folder = tmp_path / "cell"
+    rig = made_rig(folder, made, policy=ANY_AGE, every_h=24)
     copied = rig.tools.record
 
     def stepping(request: RecordingRequest, **further: Any) -> Recorded:
@@ -533,7 +568,8 @@ def test_a_clock_that_steps_in_a_session_changes_no_age(
 
 
 def test_nothing_moves_without_the_cells_own_leave(tmp_path: Path, made: Made) -> None:
-    rig = made_rig(tmp_path / "cell", made, policy={"motion": "ask"})
+    folder = tmp_path / "cell"
+    rig = made_rig(folder, made, policy={"motion": "ask"})
     with pytest.raises(MotionRefused, match="policy"):
         rig.job()
     assert rig.sessions == ()
@@ -544,14 +580,16 @@ def test_two_weighings_agree_as_they_do_everywhere(tmp_path: Path, made: Made) -
     """0.4 - 0.3 is more than 0.1 in binary;
     as for `record` and the gates, two spellings of one number are one.
     """
-    cell = made_rig(tmp_path / "cell", made).cell
+    folder = tmp_path / "cell"
+    cell = made_rig(folder, made).cell
     section = cell.recalibration
     assert section is not None
     runs = tuple(replace(run, mass_kg=None if run.payload is None else 0.4) for run in section.runs)
     payloads = tuple(
         replace(payload, mass_kg=0.3, mass_tolerance_kg=0.1) for payload in cell.payloads
     )
-    weighed = replace(cell, payloads=payloads, recalibration=replace(section, runs=runs))
+    recalibration = replace(section, runs=runs)
+    weighed = replace(cell, payloads=payloads, recalibration=recalibration)
     assert section_of(weighed).runs == runs
 
 
@@ -562,7 +600,8 @@ def test_two_weighings_agree_as_they_do_everywhere(tmp_path: Path, made: Made) -
 def test_a_run_whose_payload_is_not_the_cells_is_refused(
     tmp_path: Path, made: Made, key: str, value: object, message: str
 ) -> None:
-    rig = made_rig(tmp_path / "cell", made)
+    folder = tmp_path / "cell"
+    rig = made_rig(folder, made)
     text = rig.cell_file.read_text(encoding="utf-8")
     document = json.loads(text)
     document["recalibration"]["runs"][1][key] = value
@@ -632,7 +671,8 @@ def test_a_program_that_says_much_is_heard_to_its_end_and_not_kept(tmp_path: Pat
     )
     tracemalloc.start()
     try:
-        ended = run_command(Command(("sh", "-c", much), 60.0), (), tmp_path)
+        command = Command(("sh", "-c", much), 60.0)
+        ended = run_command(command, (), tmp_path)
         _, peak = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
@@ -647,23 +687,26 @@ def test_a_program_that_says_much_is_heard_to_its_end_and_not_kept(tmp_path: Pat
 
 
 def test_a_command_says_how_it_ended_and_leaves_nothing_behind(tmp_path: Path) -> None:
-    ended = run_command(
-        Command(("sh", "-c", 'echo "$1" in "$(pwd)"; exit 3', "x"), 10.0), ("disc",), tmp_path
-    )
+    command = Command(("sh", "-c", 'echo "$1" in "$(pwd)"; exit 3', "x"), 10.0)
+    ended = run_command(command, ("disc",), tmp_path)
     assert ended.code == 3
-    assert ended.said == f"disc in {tmp_path.resolve()}"
-    assert run_command(Command(("no such program",), 10.0), (), tmp_path).code is None
+    expected = f"disc in {tmp_path.resolve()}"
+    assert ended.said == expected
+    code = run_command(Command(("no such program",), 10.0), (), tmp_path).code
+    assert code is None
     slow = run_command(Command(("sh", "-c", "sleep 60 & echo $! > pid; wait"), 0.2), (), tmp_path)
     assert slow == Finished(None, "not ended within 0.2 s")
     with suppress(ProcessLookupError):  # which has gone already
-        started = os.pidfd_open(int((tmp_path / "pid").read_text()))
+        text = (tmp_path / "pid").read_text()
+        started = os.pidfd_open(int(text))
         ended_within_s = 30.0
         assert select.select([started], [], [], ended_within_s)[0] == [started]
         os.close(started)
 
 
 def test_a_dry_run_asks_and_writes_nothing(tmp_path: Path, made: Made) -> None:
-    rig = made_rig(tmp_path / "cell", made, warm_up_min=5)
+    folder = tmp_path / "cell"
+    rig = made_rig(folder, made, warm_up_min=5)
     before = sorted(rig.folder.rglob("*"))
     journal = Journal(rig.said, Form.JSON, lambda: rig.clock.at)
     seen = preview(
@@ -672,7 +715,8 @@ def test_a_dry_run_asks_and_writes_nothing(tmp_path: Path, made: Made) -> None:
     assert "a new session" in seen.remark
     assert seen.steps[0] == "warm up for 5 min"
     assert "mount disc, record loaded-1" in seen.steps
-    assert sorted(rig.folder.rglob("*")) == before
+    files = rig.folder.rglob("*")
+    assert sorted(files) == before
     rig.closed.unlink()
     with pytest.raises(NotReleased):
         preview(rig.cell_file, rig.cell, rig.tools, journal, who="a person", lock_folder=rig.folder)
@@ -681,7 +725,8 @@ def test_a_dry_run_asks_and_writes_nothing(tmp_path: Path, made: Made) -> None:
 def test_a_warm_up_is_made_of_the_plans_moves_and_asks_the_interlock_too(
     tmp_path: Path, made: Made
 ) -> None:
-    rig = made_rig(tmp_path / "cell", made, warm_up_min=0.2)
+    cell_folder = tmp_path / "cell"
+    rig = made_rig(cell_folder, made, warm_up_min=0.2)
     made_of = []
     copied = rig.tools.record
 
@@ -704,16 +749,19 @@ def test_a_warm_up_is_made_of_the_plans_moves_and_asks_the_interlock_too(
     rig.tools = replace(rig.tools, record=noting, run=asking)
     assert rig.job().outcome is Outcome.APPLIED
     # 12 s in passes of a plan of about 4.4 s.
-    assert made_of == ["warm-up"] * 3 + ["bare-1", "loaded-1", "held-out"]
+    expected = ["warm-up"] * 3 + ["bare-1", "loaded-1", "held-out"]
+    assert made_of == expected
     # Preflight; then before each recording, and again before its motion.
     assert asked == ["test", "sh", *["test"] * 8, "sh", *["test"] * 2, "sh", *["test"] * 2]
-    assert not list(rig.session.folder.glob("warm-up*"))
+    files = rig.session.folder.glob("warm-up*")
+    assert not list(files)
 
 
 def test_a_link_that_no_write_would_follow_is_refused_before_anything_is_recorded(
     tmp_path: Path, short_plan: Path
 ) -> None:
-    rig = make_rig(tmp_path / "cell", short_plan)
+    folder = tmp_path / "cell"
+    rig = make_rig(folder, short_plan)
     behind = tmp_path / "open" / "gains.yaml"
     behind.parent.mkdir()
     rig.controller.rename(behind)

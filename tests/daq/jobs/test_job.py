@@ -28,7 +28,8 @@ def test_a_whole_job_applies_what_it_found_and_leaves_everything_that_records_it
     session = rig.session
     assert session.state.outcome is Outcome.APPLIED
     assert session.state.exit_code == ExitCode.OK
-    names = {path.name for path in session.folder.rglob("*")}
+    files = session.folder.rglob("*")
+    names = {path.name for path in files}
     assert {
         "calibration.yaml",
         "report.html",
@@ -37,49 +38,59 @@ def test_a_whole_job_applies_what_it_found_and_leaves_everything_that_records_it
         "proposal.diff",
         "state.json",
     } <= names
-    found = {
-        gain["axis"]: gain["value"]
-        for gain in yaml.safe_load((session.folder / "calibration.yaml").read_text())["gains"]
-    }
-    written = yaml.safe_load(rig.controller.read_text())["drives"]
+    text = (session.folder / "calibration.yaml").read_text()
+    gains = yaml.safe_load(text)["gains"]
+    found = {gain["axis"]: gain["value"] for gain in gains}
+    document = yaml.safe_load(rig.controller.read_text())
+    written = document["drives"]
     for axis, value in found.items():
         assert written[axis]["gain"] == pytest.approx(value, rel=1e-3)
     actions = [entry.action for entry in rig.audit]
-    assert actions == [
+    expected = [
         AuditAction.RECALIBRATION_BEGUN,
         AuditAction.CALIBRATION_ENTERED,
         AuditAction.APPLY_BEGUN,
         AuditAction.APPLIED,
         AuditAction.RECALIBRATION_ENDED,
     ]
-    assert rig.audit[-1].details["outcome"] == "applied"
-    assert rig.audit[-1].sha256 == session.state.audit_sha256
+    assert actions == expected
+    details = rig.audit[-1].details
+    assert details["outcome"] == "applied"
+    sha256 = rig.audit[-1].sha256
+    assert sha256 == session.state.audit_sha256
     history = history_of(rig.cell_file)
     assert [(event.who, event.audit) for event in history.events] == [(WHO, rig.audit[3].sha256)]
     assert history.in_force(str(rig.controller)) == rig.audit[-1].details["calibration_sha256"]
     # By which `history --verify` notices an audit whose end was cut off.
-    assert noted_heads(rig.cells / "demo.audit.jsonl") == (rig.audit[-1].sha256,)
+    demo_path = rig.cells / "demo.audit.jsonl"
+    assert noted_heads(demo_path) == (rig.audit[-1].sha256,)
     # The current gains are the nameplates, which have no σ.
     assert session.state.decision is not None
-    assert {gain.old_std for gain in session.state.decision.gains} == {0.0}
-    assert [gain.alarm for gain in session.state.watched] == [""] * 6
-    summary = json.loads((session.folder / "summary.json").read_text())
+    old_stds = {gain.old_std for gain in session.state.decision.gains}
+    assert old_stds == {0.0}
+    alarms = [gain.alarm for gain in session.state.watched]
+    assert alarms == [""] * 6
+    summary_path = session.folder / "summary.json"
+    summary = json.loads(summary_path.read_text())
     assert list(summary)[:6] == ["outcome", "exit_code", "remark", "to_do", "folder", "format"]
     assert summary["outcome"] == "applied"
     assert "drivegain rollback" in " ".join(summary["to_do"])
     metrics = (rig.cells / "drivegain_demo.prom").read_text()
     assert 'drivegain_recalibration_outcome{cell="demo",outcome="applied"} 1.0' in metrics
     assert 'drivegain_recalibration_gain_drift_sigma{axis="J4",cell="demo"}' in metrics
-    assert {event["level"] for event in rig.events} <= {"info", "notice", "warning"}
+    levels = {event["level"] for event in rig.events}
+    assert levels <= {"info", "notice", "warning"}
 
 
 def test_the_rollback_and_its_rollback_to_what_a_job_wrote_is_known(
     tmp_path: Path, made: Made
 ) -> None:
-    rig = made_rig(tmp_path / "cell", made)
+    folder = tmp_path / "cell"
+    rig = made_rig(folder, made)
     rig.job()
     target = str(rig.controller)
-    digest = rig.audit[-1].details["calibration_sha256"]
+    details = rig.audit[-1].details
+    digest = details["calibration_sha256"]
     known: list[str | None] = []
     for _ in range(2):
         assert main(["rollback", "--cell", str(rig.cell_file), "--by", "a person"]) == ExitCode.OK
@@ -92,7 +103,8 @@ def test_the_payload_was_changed_between_the_runs(whole_job: tuple[Rig, Made]) -
     gain.
     """
     rig, made = whole_job
-    assert (rig.cells / "mounted").read_text() == "disc\n"
+    mounted_folder = rig.cells / "mounted"
+    assert mounted_folder.read_text() == "disc\n"
     mounted = [event["payload"] for event in rig.events if event["event"] == "mounted"]
     assert mounted == ["none", "disc", "disc"]
     assert made.closed.final.training_error.total < 10.0
@@ -101,27 +113,32 @@ def test_the_payload_was_changed_between_the_runs(whole_job: tuple[Rig, Made]) -
 def test_a_session_that_was_begun_with_now_is_taken_up_by_a_plain_job(
     tmp_path: Path, made: Made
 ) -> None:
-    rig = made_rig(tmp_path / "cell", made, every_h=144, resume_within_h=12)
+    folder = tmp_path / "cell"
+    rig = made_rig(folder, made, every_h=144, resume_within_h=12)
     assert rig.job().outcome is Outcome.APPLIED
     section = rig.cell.recalibration
     cell = rig.cell
     assert section is not None
     rig.clock.go_on(hours=1)
-    stopped = sessions.begin(section.folder, basis_of(cell, section), rig.clock())
+    basis = basis_of(cell, section)
+    stopped = sessions.begin(section.folder, basis, rig.clock())
     rig.clock.go_on(minutes=10)
-    stopped.update(outcome=Outcome.STOPPED, ended=rig.clock().isoformat())
+    ended = rig.clock().isoformat()
+    stopped.update(outcome=Outcome.STOPPED, ended=ended)
     rig.clock.go_on(hours=13)
     assert rig.job().outcome is Outcome.NOT_DUE
     rig.clock.go_on(hours=-12)
     assert rig.job().outcome is Outcome.UNCHANGED
     last = rig.sessions[-1].state
-    assert (last.session, last.attempt) == (stopped.state.session, 2)
+    expected = (stopped.state.session, 2)
+    assert (last.session, last.attempt) == expected
 
 
 def test_nothing_is_due_while_the_last_good_calibration_is_young(
     tmp_path: Path, made: Made
 ) -> None:
-    rig = made_rig(tmp_path / "cell", made, every_h=144)
+    folder = tmp_path / "cell"
+    rig = made_rig(folder, made, every_h=144)
     assert rig.job().outcome is Outcome.APPLIED
     before = rig.controller.read_bytes()
     for hours in (1, 100, 42):

@@ -57,24 +57,29 @@ def _faults(make: Callable[[], Scene]) -> list[FaultRow]:
     for unit in scene.units():
         last[unit.call, unit.file] = unit
     rows = [scene.run(last[call, file], Injection(name)) for call, file, name in SAMPLE]
-    rows.append(scene.run(last["fsync", "folder"], Injection("EIO", is_lasting=True)))
+    injection = Injection("EIO", is_lasting=True)
+    rows.append(scene.run(last["fsync", "folder"], injection))
     return rows
 
 
 def _judge(rows: list[FaultRow]) -> None:
     found = [(row.call, row.file, row.false_sentences, row.bad_states) for row in rows]
-    assert found == [(row.call, row.file, (), ()) for row in rows]
-    assert {row.content for row in rows} == {"old", "new"}
+    expected = [(row.call, row.file, (), ()) for row in rows]
+    assert found == expected
+    contents = {row.content for row in rows}
+    assert contents == {"old", "new"}
 
 
 def test_sampled_faults_of_a_job_leave_the_truth_and_the_next_job_ends_well(
     tmp_path: Path, made: Made, small: Executor
 ) -> None:
-    _judge(small.submit(_faults, partial(JobScene, tmp_path.resolve(), made)).result())
+    rows = small.submit(_faults, partial(JobScene, tmp_path.resolve(), made)).result()
+    _judge(rows)
 
 
 def test_sampled_faults_of_a_session_leave_the_truth_and_the_same_command_ends_well(
     tmp_path: Path, made_session: MadeSession, small: Executor
 ) -> None:
     make = partial(SessionScene, tmp_path.resolve(), made_session)
-    _judge(small.submit(_faults, make).result())
+    rows = small.submit(_faults, make).result()
+    _judge(rows)

@@ -27,7 +27,8 @@ AT = datetime(2026, 1, 5, 3, 0, tzinfo=UTC)
 
 def said(form: Form, level: Level = Level.INFO, event: str = "event", **fields: object) -> str:
     stream = io.StringIO()
-    Journal(stream, form, lambda: AT, session="s", step="fit").say(level, event, **fields)
+    journal = Journal(stream, form, lambda: AT, session="s", step="fit")
+    journal.say(level, event, **fields)
     return stream.getvalue()
 
 
@@ -84,7 +85,8 @@ def test_a_person_reads_no_keys_and_no_lists_of_python() -> None:
         ": free 500 MB, seconds 30, payload none\n"
     )
     # Programs read the keys as ever.
-    assert json.loads(said(Form.JSON, missing=(0, 0, 0)))["missing"] == [0, 0, 0]
+    document = json.loads(said(Form.JSON, missing=(0, 0, 0)))
+    assert document["missing"] == [0, 0, 0]
 
 
 def test_a_person_reads_a_finding_once_in_the_conclusion() -> None:
@@ -96,14 +98,17 @@ def test_a_person_reads_a_finding_once_in_the_conclusion() -> None:
 
 
 def test_numbers_that_json_cannot_say_are_null() -> None:
-    assert json.loads(said(Form.JSON, gain=math.nan, more=[math.inf, 1.0]))["more"] == [None, 1.0]
+    more = [math.inf, 1.0]
+    document = json.loads(said(Form.JSON, gain=math.nan, more=more))
+    assert document["more"] == [None, 1.0]
 
 
 def test_a_reader_that_has_gone_does_not_stop_a_job(tmp_path: Path) -> None:
     read, write = os.pipe()
     os.close(read)
     with os.fdopen(write, "w") as stream:
-        Journal(stream, Form.JSON, lambda: AT).say(Level.INFO, "event")
+        journal = Journal(stream, Form.JSON, lambda: AT)
+        journal.say(Level.INFO, "event")
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
@@ -111,32 +116,37 @@ def test_the_journal_is_known_by_the_stream_that_systemd_names(tmp_path: Path) -
     path = tmp_path / "stderr"
     with path.open("w") as stream:
         found = os.fstat(stream.fileno())
-        assert form_of(stream, {"JOURNAL_STREAM": f"{found.st_dev}:{found.st_ino}"}) is Form.JOURNAL
+        environment = {"JOURNAL_STREAM": f"{found.st_dev}:{found.st_ino}"}
+        assert form_of(stream, environment) is Form.JOURNAL
         # Of a service whose stderr was redirected since.
-        assert form_of(stream, {"JOURNAL_STREAM": "1:2"}) is Form.JSON
+        form = form_of(stream, {"JOURNAL_STREAM": "1:2"})
+        assert form is Form.JSON
         assert form_of(stream, {}) is Form.JSON
 
 
 def written(outcome: Outcome, folder: Path) -> Path:
-    return write_metrics(folder, 'the "cell"\\', Conclusion(outcome, 11, None, ""), AT, 12.5, None)
+    conclusion = Conclusion(outcome, 11, None, "")
+    return write_metrics(folder, 'the "cell"\\', conclusion, AT, 12.5, None)
 
 
 def test_metrics_are_replaced_whole_and_can_be_read_by_the_collector(tmp_path: Path) -> None:
     (tmp_path / "drivegain_the_cell__e183a8.prom").write_text("half of a fi")
     path = written(Outcome.STOPPED, tmp_path)
     assert path.name == "drivegain_the_cell__e183a8.prom"
-    assert path.stat().st_mode & 0o777 == 0o644
+    st_mode = path.stat().st_mode
+    assert st_mode & 0o777 == 0o644
     assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
     families = {family.name: family for family in text_string_to_metric_families(path.read_text())}
-    outcomes = {
-        s.labels["outcome"]: s.value for s in families["drivegain_recalibration_outcome"].samples
-    }
+    samples = families["drivegain_recalibration_outcome"].samples
+    outcomes = {s.labels["outcome"]: s.value for s in samples}
     assert outcomes["stopped"] == 1.0
     assert sum(outcomes.values()) == 1.0
-    assert families["drivegain_recalibration_exit_code"].samples[0].labels["cell"] == 'the "cell"\\'
+    first_sample = families["drivegain_recalibration_exit_code"].samples[0]
+    assert first_sample.labels["cell"] == 'the "cell"\\'
     assert "drivegain_recalibration_last_success_timestamp_seconds" not in families
 
 
 def test_a_folder_that_is_not_there_is_reported(tmp_path: Path) -> None:
+    folder = tmp_path / "none"
     with pytest.raises(OutputFailed, match="no such file"):
-        written(Outcome.APPLIED, tmp_path / "none")
+        written(Outcome.APPLIED, folder)

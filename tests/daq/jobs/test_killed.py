@@ -103,9 +103,12 @@ def applied_once(rig: Rig) -> None:
 @pytest.fixture(scope="module")
 def calls(tmp_path_factory: pytest.TempPathFactory, made: Made) -> list[str]:
     """System calls of a job that runs to its end."""
-    rig = made_rig(tmp_path_factory.mktemp("counted") / "cell", made, metrics=None)
+    folder = tmp_path_factory.mktemp("counted") / "cell"
+    rig = made_rig(folder, made, metrics=None)
     kill = Kill()
-    assert replace(rig, tools=kill.tools(rig.tools)).job().outcome is Outcome.APPLIED
+    tools = kill.tools(rig.tools)
+    changed_rig = replace(rig, tools=tools)
+    assert changed_rig.job().outcome is Outcome.APPLIED
     return kill.calls
 
 
@@ -125,9 +128,10 @@ def test_a_job_that_is_killed_at_any_call_is_finished_by_the_next(
     for at, name in enumerate(calls):
         chosen = name not in PURE and calls[:at].count(name) % FREQUENT.get(name, 1) == 0
         if chosen and (name in EFFECTS or not behind):
-            finished_by_the_next(
-                made_rig(tmp_path / f"{at}-{name}", made, metrics=None), Kill(at, behind=behind)
-            )
+            folder = tmp_path / f"{at}-{name}"
+            rig = made_rig(folder, made, metrics=None)
+            kill = Kill(at, behind=behind)
+            finished_by_the_next(rig, kill)
 
 
 def finished_by_the_next(rig: Rig, kill: Kill) -> None:
@@ -143,7 +147,8 @@ def finished_by_the_next(rig: Rig, kill: Kill) -> None:
     outcome = rig.job().outcome
     if outcome is not Outcome.NOT_DUE:
         assert outcome is Outcome.APPLIED
-        assert rig.session.state.attempt == 1 + begun
+        attempt = rig.session.state.attempt
+        assert attempt == 1 + begun
     assert rig.controller.read_bytes() != before
     if whole != before:
         assert rig.controller.read_bytes() == whole
@@ -180,7 +185,8 @@ def finished_from_any_moment(rig: Rig, wait_s: float) -> tuple[bool, bool]:
     assert after != before
     assert left in (before, after)
     # Killed between backup and replacement, the next job backs the same content up once more.
-    assert {backup.read_bytes() for backup in rig.backups} == {before}
+    contents = {backup.read_bytes() for backup in rig.backups}
+    assert contents == {before}
     assert _verified(rig).complete
     return killed, left == after
 
@@ -199,12 +205,13 @@ def test_a_job_that_is_killed_at_a_random_moment_is_finished_by_the_next(
     tmp_path: Path, made: Made
 ) -> None:
     """A few moments; `tests.studies.recalibration_study --moments 60` takes more."""
-    whole_s = job_duration_s(made_rig(tmp_path / "whole", made, metrics=None))
+    folder = tmp_path / "whole"
+    whole_s = job_duration_s(made_rig(folder, made, metrics=None))
     chance = random.Random(1)
     for number in range(4):
-        finished_from_any_moment(
-            made_rig(tmp_path / str(number), made, metrics=None), chance.uniform(0.0, whole_s)
-        )
+        rig = made_rig(tmp_path / str(number), made, metrics=None)
+        wait_s = chance.uniform(0.0, whole_s)
+        finished_from_any_moment(rig, wait_s)
 
 
 def job_duration_s(rig: Rig) -> float:
@@ -219,13 +226,16 @@ def test_a_rollback_by_hand_after_a_killed_write_is_not_written_again(
     tmp_path: Path, made: Made, calls: list[str], way: str
 ) -> None:
     """The file is as it was before the write; only the audit knows that there was one."""
-    rig = made_rig(tmp_path / "cell", made)
-    killed_job(rig, Kill(calls.index("apply"), behind=True))
+    folder = tmp_path / "cell"
+    rig = made_rig(folder, made)
+    kill = Kill(calls.index("apply"), behind=True)
+    killed_job(rig, kill)
     assert rig.session.state.outcome is None
     (backup,) = rig.backups
     if way == "rollback":
+        target = FileTarget(rig.controller)
         rollback(
-            FileTarget(rig.controller),
+            target,
             rig.clock(),
             audit=rig.cells / "demo.audit.jsonl",
             who="a person",
@@ -237,16 +247,19 @@ def test_a_rollback_by_hand_after_a_killed_write_is_not_written_again(
     rolled_back = rig.controller.read_bytes()
     rig.clock.go_on(minutes=10)
     ended = rig.job()
-    assert (ended.outcome, ended.exit_code) == (Outcome.PROPOSED, ExitCode.PROPOSED)
+    expected = (Outcome.PROPOSED, ExitCode.PROPOSED)
+    assert (ended.outcome, ended.exit_code) == expected
     assert "rolled back since the session began" in ended.remark
     assert rig.controller.read_bytes() == rolled_back
-    assert [entry.action for entry in rig.audit].count(AuditAction.APPLIED) == 1
+    actions = [entry.action for entry in rig.audit]
+    assert actions.count(AuditAction.APPLIED) == 1
     assert rig.job().outcome is Outcome.NOT_DUE
     assert rig.controller.read_bytes() == rolled_back
 
 
 def test_half_a_recording_is_kept_as_partial_and_recorded_again(tmp_path: Path, made: Made) -> None:
-    rig = made_rig(tmp_path / "cell", made)
+    folder = tmp_path / "cell"
+    rig = made_rig(folder, made)
     whole = made.logs["loaded-1"].read_bytes()
     copied = rig.tools.record
 
@@ -259,10 +272,12 @@ def test_half_a_recording_is_kept_as_partial_and_recorded_again(tmp_path: Path, 
 
     rig.tools = replace(rig.tools, record=dies)
     killed_job(rig, Kill())
-    assert [run.name for run in rig.session.state.runs] == ["bare-1"]
+    runs = rig.session.state.runs
+    assert [run.name for run in runs] == ["bare-1"]
     rig.tools = replace(rig.tools, record=copied)
     assert rig.job().outcome is Outcome.APPLIED
-    names = {path.name for path in rig.session.folder.iterdir()}
+    files = rig.session.folder.iterdir()
+    names = {path.name for path in files}
     assert "loaded-1-partial-1.mcap" in names
     assert "loaded-1.mcap.part" not in names
     applied_once(rig)
@@ -271,13 +286,16 @@ def test_half_a_recording_is_kept_as_partial_and_recorded_again(tmp_path: Path, 
 def test_a_log_that_is_not_what_was_recorded_is_recorded_again(
     tmp_path: Path, made: Made, calls: list[str]
 ) -> None:
-    rig = made_rig(tmp_path / "cell", made)
-    killed_job(rig, Kill(calls.index("fit")))
+    folder = tmp_path / "cell"
+    rig = made_rig(folder, made)
+    kill = Kill(calls.index("fit"))
+    killed_job(rig, kill)
     log = rig.session.folder / "bare-1.mcap"
     log.write_bytes(log.read_bytes()[:-1] + b"\0")
     assert rig.job().outcome is Outcome.APPLIED
     assert (rig.session.folder / "bare-1-aside-1.mcap").exists()
-    assert rig.session.state.runs[-1].name == "bare-1"
+    last_run = rig.session.state.runs[-1]
+    assert last_run.name == "bare-1"
 
 
 def too_old(rig: Rig) -> None:
@@ -298,10 +316,14 @@ def with_another_plan(rig: Rig) -> None:
 def test_a_session_of_something_else_is_not_taken_up(
     tmp_path: Path, made: Made, calls: list[str], change: Callable[[Rig], None]
 ) -> None:
-    own = replace(made, plan_file=tmp_path / "cell" / "cells" / "plan.yaml")
-    rig = made_rig(tmp_path / "cell", own, resume_within_h=2)
+    cells_folder = tmp_path / "cell" / "cells"
+    plan_file = cells_folder / "plan.yaml"
+    own = replace(made, plan_file=plan_file)
+    folder = tmp_path / "cell"
+    rig = made_rig(folder, own, resume_within_h=2)
     shutil.copyfile(made.plan_file, own.plan_file)
-    killed_job(rig, Kill(calls.index("fit")))
+    kill = Kill(calls.index("fit"))
+    killed_job(rig, kill)
     change(rig)
     rig.tools = own.tools(rig)
     assert rig.job().outcome is Outcome.APPLIED

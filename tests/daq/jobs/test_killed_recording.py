@@ -33,14 +33,16 @@ SHARE = 0.5  #: Of the size of a whole log that is written when the job is kille
 def cell_process(rig: Rig) -> Iterator[None]:
     """`drivegain simulate` on a hub of its own, to which the rig's cell file is changed."""
     command = [sys.executable, "-m", "daq", "simulate", "demo", "--port", "0"]
+    mounted_folder = rig.cells / "mounted"
     with subprocess.Popen(
-        [*command, "--payload-from", str(rig.cells / "mounted")], stdout=subprocess.PIPE, text=True
+        [*command, "--payload-from", str(mounted_folder)], stdout=subprocess.PIPE, text=True
     ) as process:
         try:
             assert process.stdout is not None
             found = re.search(r"can0@127\.0\.0\.1:(\d+)", process.stdout.readline())
             assert found is not None
-            document = json.loads(rig.cell_file.read_text(encoding="utf-8"))
+            text = rig.cell_file.read_text(encoding="utf-8")
+            document = json.loads(text)
             document["bus"] |= {"interface": "socketcand", "channel": "can0", "port": int(found[1])}
             document["bus"] |= {"host": "127.0.0.1"}
             document["sync"]["period_us"] = 1000  # of the shipped simulation
@@ -65,7 +67,8 @@ def kill_while_recording(rig: Rig, name: str, part_bytes: float) -> None:
     child = in_a_child(lambda: rig.job().exit_code)
     ended = 0
     while not ended:
-        parts = [path.stat().st_size for path in rig.cells.glob(f"*/*/{name}.mcap{UNFINISHED}")]
+        files = rig.cells.glob(f"*/*/{name}.mcap{UNFINISHED}")
+        parts = [path.stat().st_size for path in files]
         if parts and parts[0] > part_bytes:
             os.kill(child, signal.SIGKILL)
             break
@@ -82,7 +85,9 @@ def taken_up_from_a_recording(rig: Rig, made: Made, name: str, share: float) -> 
     """
     rig = real_recorder(rig, made)
     with cell_process(rig):
-        kill_while_recording(rig, name, share * made.logs[name].stat().st_size)
+        stat = made.logs[name].stat()
+        part_bytes = share * stat.st_size
+        kill_while_recording(rig, name, part_bytes)
         assert rig.session.state.outcome is None
         rig.clock.go_on(minutes=10)
         assert rig.job().outcome is Outcome.APPLIED
@@ -92,4 +97,6 @@ def taken_up_from_a_recording(rig: Rig, made: Made, name: str, share: float) -> 
 
 def test_a_job_killed_in_a_recording_is_taken_up_by_the_next(tmp_path: Path, made: Made) -> None:
     """One moment; `tests.studies.recalibration_study --recordings 5` takes more."""
-    taken_up_from_a_recording(make_rig(tmp_path / "cell", made.plan_file), made, "bare-1", SHARE)
+    folder = tmp_path / "cell"
+    rig = make_rig(folder, made.plan_file)
+    taken_up_from_a_recording(rig, made, "bare-1", SHARE)

@@ -106,7 +106,8 @@ def killed_rig(folder: Path, made: MadeSession, *, real: bool = False) -> Rig:
         # The cell file may get another bus once there is a cell.
         return save_certificate(rig.cell_file, rig.cell, fitted, changed, calibration, report)
 
-    rig.tools = replace(tools, save_report=save_page, record=moving(rig, tools.record))
+    record = moving(rig, tools.record)
+    rig.tools = replace(tools, save_report=save_page, record=record)
     return rig
 
 
@@ -132,7 +133,8 @@ def moving(rig: Rig, record: Callable[..., Recorded]) -> Callable[..., Recorded]
 
 
 def leave_line(rig: Rig, text: str) -> None:
-    with (rig.cells / "events").open("a") as file:
+    events_folder = rig.cells / "events"
+    with events_folder.open("a") as file:
         file.write(f"{text}\n")
 
 
@@ -164,7 +166,8 @@ def session_in_a_child(rig: Rig) -> int:
     tools = noting(rig)
 
     def work() -> int:
-        return run_session(replace(rig, tools=tools)).exit_code
+        changed_rig = replace(rig, tools=tools)
+        return run_session(changed_rig).exit_code
 
     return in_a_child(work)
 
@@ -191,10 +194,12 @@ def drawn_moment(calls: list[TimedCall], chance: random.Random) -> Moment:
     """Any tool first, so that a short stage is as likely as a long one;
     then any of its calls, and any moment of it.
     """
-    tool = chance.choice(sorted({call.tool for call in calls}))
+    tools = {call.tool for call in calls}
+    tool = chance.choice(sorted(tools))
     of_tool = [call for call in calls if call.tool == tool]
     number = chance.randrange(len(of_tool))
-    return Moment(tool, number, chance.uniform(0.0, of_tool[number].duration_s))
+    wait_s = chance.uniform(0.0, of_tool[number].duration_s)
+    return Moment(tool, number, wait_s)
 
 
 def killed_at(rig: Rig, moment: Moment) -> bool:
@@ -245,13 +250,15 @@ def written_once(rig: Rig, before: bytes) -> None:
     state = rig.session.state
     assert isinstance(state, GuidedState)
     assert state.outcome is Outcome.APPLIED
-    assert [run.name for run in state.runs] == [block.name for block in state.blocks]
+    expected = [block.name for block in state.blocks]
+    assert [run.name for run in state.runs] == expected
     actions = [entry.action for entry in rig.audit]
     assert actions.count(AuditAction.APPLIED) <= 1
     assert actions.count(AuditAction.ACCEPTED) == 1
     assert actions.count(AuditAction.CALIBRATION_ENTERED) == 1
     # Killed between backup and replacement, the next command backs the same content up once more.
-    assert {backup.read_bytes() for backup in rig.backups} == {before}
+    contents = {backup.read_bytes() for backup in rig.backups}
+    assert contents == {before}
     history = history_of(rig.cell_file)
     assert len(history.events) == len(history.entries) == 1
     found = verify_ledger(ledger_of(rig.cell_file))
@@ -266,7 +273,8 @@ def written_once(rig: Rig, before: bytes) -> None:
 
 def released_before_each_motion(rig: Rig) -> None:
     """Check that the interlock was asked right before each motion."""
-    events = (rig.cells / "events").read_text().split()
+    events_folder = rig.cells / "events"
+    events = events_folder.read_text().split()
     assert events.count(MOTION) >= 4  # three blocks and the acceptance
     assert events[0] != MOTION
     assert all(one != MOTION for one, other in pairwise(events) if other == MOTION)
@@ -277,10 +285,11 @@ def test_a_session_that_is_killed_at_a_random_moment_ends_with_the_same_command(
     tmp_path: Path, made_session: MadeSession
 ) -> None:
     """A few moments; `tests.studies.session_kills` takes more."""
-    calls = timed_calls(killed_rig(tmp_path / "timed", made_session))
-    assert {call.tool for call in calls} == set(CALLED)
+    folder = tmp_path / "timed"
+    calls = timed_calls(killed_rig(folder, made_session))
+    tools = {call.tool for call in calls}
+    assert tools == set(CALLED)
     chance = random.Random(1)
     for number in range(4):
-        ends_well_after(
-            killed_rig(tmp_path / f"{number}", made_session), drawn_moment(calls, chance)
-        )
+        rig = killed_rig(tmp_path / f"{number}", made_session)
+        ends_well_after(rig, drawn_moment(calls, chance))

@@ -40,7 +40,8 @@ def leave(cell: SimulatedCell, state: PowerState, recorder_id: int = 127) -> Pow
     the axis does not leave a quick stop by itself.
     """
     node = cell.nodes[AXIS]
-    node.write(0x605A, 0, struct.pack("<h", 6))
+    packed = struct.pack("<h", 6)
+    node.write(0x605A, 0, packed)
     node.write(0x1016, 1, struct.pack("<I", recorder_id << 16 | GUARD_MS))
     node.drive.state = state
     return state
@@ -51,13 +52,13 @@ def leave(cell: SimulatedCell, state: PowerState, recorder_id: int = 127) -> Pow
 def test_a_drive_that_was_left_without_motion_loses_its_power_to_a_job_alone(
     tmp_path: Path, one_move: Path, state: PowerState, take_over: bool
 ) -> None:
-    rig = make_rig(tmp_path / "cell", one_move)
+    folder = tmp_path / "cell"
+    rig = make_rig(folder, one_move)
     with serving(rig) as cell:
         leave(cell, state)
         check_drives(rig.cell, nullcontext, take_over)
-        assert cell.nodes[AXIS].drive.state is (
-            PowerState.SWITCH_ON_DISABLED if take_over else state
-        )
+        drive = cell.nodes[AXIS].drive
+        assert drive.state is (PowerState.SWITCH_ON_DISABLED if take_over else state)
         assert cell.plant.time_s < 1.0
 
 
@@ -78,7 +79,8 @@ def test_a_drive_that_is_anothers_or_did_not_stop_is_a_persons_business(
     """An axis with id 3 is there, and no recorder takes 100:
     neither was a recorder that is gone.
     """
-    rig = make_rig(tmp_path / "cell", one_move)
+    folder = tmp_path / "cell"
+    rig = make_rig(folder, one_move)
     with serving(rig) as cell:
         leave(cell, state, recorder_id)
         with pytest.raises(
@@ -95,7 +97,8 @@ def test_a_drive_that_moves_in_its_quick_stop_is_left_alone(
 ) -> None:
     places = iter(((0,), (17,)))
     monkeypatch.setattr(daq.jobs.context, "_positions", lambda *_: next(places))
-    rig = make_rig(tmp_path / "cell", one_move)
+    folder = tmp_path / "cell"
+    rig = make_rig(folder, one_move)
     with serving(rig) as cell:
         leave(cell, STAYS)
         with pytest.raises(StateRefused, match=r"17 counts in 0\.2 s: press the emergency stop"):
@@ -107,13 +110,15 @@ def test_a_job_beside_a_master_whose_lock_is_not_seen_sends_nothing(
     tmp_path: Path, one_move: Path
 ) -> None:
     """A recorder on another computer: the axes may be in the middle of its motion."""
-    rig = make_rig(tmp_path / "cell", one_move)
+    folder = tmp_path / "cell"
+    rig = make_rig(folder, one_move)
     over = threading.Event()
     with serving(rig), open_bus(bus_address(rig.cell)) as master:
 
         def lead() -> None:
             while not over.wait(0.01):
-                master.send(can.Message(arbitration_id=0x80, is_extended_id=False))
+                message = can.Message(arbitration_id=0x80, is_extended_id=False)
+                master.send(message)
 
         leading = threading.Thread(target=lead)
         leading.start()
@@ -124,4 +129,5 @@ def test_a_job_beside_a_master_whose_lock_is_not_seen_sends_nothing(
             over.set()
             leading.join()
         heard = [frame.arbitration_id for frame in iter(lambda: master.recv(0.0), None)]
-    assert [number for number in heard if 0x600 < number < 0x680] == []
+    numbers = [number for number in heard if 0x600 < number < 0x680]
+    assert numbers == []

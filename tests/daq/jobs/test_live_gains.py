@@ -43,23 +43,31 @@ class Recorded:
     @property
     def log(self) -> Log:
         """What was recorded then."""
-        return read_log(self.folder / f"{self.block}.mcap")
+        path = self.folder / f"{self.block}.mcap"
+        return read_log(path)
 
     @property
     def facts(self) -> RunFacts:
         """As the recorder published them."""
         log = self.log
         scale = scaling(self.rig.cell, log.head.readback)
+        moves = sum(event.kind is EventKind.MOVE_END for event in log.events)
+        axes = self.rig.cell.axis_names
+        rate_hz = log.head.run.rate_hz
+        rad_per_count = scale.rad_per_count.tolist()
+        current_per_unit = scale.current_per_unit.tolist()
+        to_joint = scale.to_joint.tolist()
+        offset_rad = scale.offset_rad.tolist()
         return RunFacts(
             run_id="id",
             log=str(self.folder / f"{self.block}.mcap"),
-            axes=self.rig.cell.axis_names,
-            rate_hz=log.head.run.rate_hz,
-            moves=sum(event.kind is EventKind.MOVE_END for event in log.events),
-            rad_per_count=scale.rad_per_count.tolist(),
-            current_per_unit=scale.current_per_unit.tolist(),
-            to_joint=scale.to_joint.tolist(),
-            offset_rad=scale.offset_rad.tolist(),
+            axes=axes,
+            rate_hz=rate_hz,
+            moves=moves,
+            rad_per_count=rad_per_count,
+            current_per_unit=current_per_unit,
+            to_joint=to_joint,
+            offset_rad=offset_rad,
             payload=None if log.head.run.payload is None else log.head.run.payload.name,
             bus_load={},
         )
@@ -79,15 +87,12 @@ class Recorded:
             time_ns = int(rows.time_ns[number])
             while events and events[0].time_ns < time_ns:
                 feed.event(events.pop(0))
-            feed.sample(
-                Sample(
-                    int(rows.cycle[number]),
-                    time_ns,
-                    tuple(rows.position_counts[number].tolist()),
-                    tuple(rows.current_raw[number].tolist()),
-                    tuple(rows.statusword[number].tolist()),
-                )
-            )
+            position_counts = tuple(rows.position_counts[number].tolist())
+            current_raw = tuple(rows.current_raw[number].tolist())
+            statusword = tuple(rows.statusword[number].tolist())
+            cycle = int(rows.cycle[number])
+            sample = Sample(cycle, time_ns, position_counts, current_raw, statusword)
+            feed.sample(sample)
         for event in events:
             feed.event(event)
         feed.finish()
@@ -120,15 +125,15 @@ def while_recording(whole_session: tuple[Rig, MadeSession], folder: Path, block:
     assert isinstance(state, GuidedState)
     names = [one.name for one in state.blocks]
     before = names[: names.index(block)]
-    then = state.model_copy(
-        update={
-            "blocks": tuple(one for one in state.blocks if one.name in (*before, block)),
-            "runs": tuple(run for run in state.runs if run.name in before),
-            "gains": (),
-            "outcome": None,
-            "ended": None,
-        }
-    )
+    runs = tuple(run for run in state.runs if run.name in before)
+    update = {
+        "blocks": tuple(one for one in state.blocks if one.name in (*before, block)),
+        "runs": runs,
+        "gains": (),
+        "outcome": None,
+        "ended": None,
+    }
+    then = state.model_copy(update=update)
     copy = folder / session.folder.name
     shutil.copytree(session.folder, copy)
     save(Session(copy, then))
@@ -155,7 +160,8 @@ def looks_at(recorded: Recorded, *, every: int = 1, gap: bool = False) -> list[Q
 def test_a_bare_block_alone_gives_no_figures(
     whole_session: tuple[Rig, MadeSession], tmp_path: Path
 ) -> None:
-    looks = looks_at(while_recording(whole_session, tmp_path, "block-1-bare"))
+    recorded = while_recording(whole_session, tmp_path, "block-1-bare")
+    looks = looks_at(recorded)
     assert looks
     assert not any(look.gains for look in looks)
     assert {look.missing.split(",")[0] for look in looks} == {"the gains need a known mass"}
@@ -168,13 +174,16 @@ def test_the_gains_come_while_the_loaded_block_is_recorded(
     looks = looks_at(recorded)
     moves = [look.move for look in looks]
     assert moves == sorted(set(moves))
-    assert moves[-1] == recorded.facts.moves == looks[-1].moves
+    last_move = moves[-1]
+    assert last_move == recorded.facts.moves == looks[-1].moves
     last = looks[-1]
     assert last.missing == ""
     assert last.why
-    true = {gain.axis: gain for gain in whole_session[1].calibration.gains}
+    gains = whole_session[1].calibration.gains
+    true = {gain.axis: gain for gain in gains}
     for gain in last.gains:
-        allowed = 4.0 * (0.01 * gain.std_percent * abs(gain.value) + true[gain.axis].std)
+        std = true[gain.axis].std
+        allowed = 4.0 * (0.01 * gain.std_percent * abs(gain.value) + std)
         assert gain.value == pytest.approx(true[gain.axis].value, abs=allowed), gain.axis
         assert gain.target_percent == TARGET_PERCENT
 
@@ -182,16 +191,19 @@ def test_the_gains_come_while_the_loaded_block_is_recorded(
 def test_the_moves_of_a_held_out_block_do_not_count(
     whole_session: tuple[Rig, MadeSession], tmp_path: Path
 ) -> None:
-    looks = looks_at(while_recording(whole_session, tmp_path, "block-3-held-out"))
+    recorded = while_recording(whole_session, tmp_path, "block-3-held-out")
+    looks = looks_at(recorded)
     assert all(look.is_held_out for look in looks)
-    assert len({json.dumps(asdict(look)["gains"]) for look in looks}) == 1
+    texts = {json.dumps(asdict(look)["gains"]) for look in looks}
+    assert len(texts) == 1
     assert looks[0].gains
 
 
 def test_lost_samples_are_said_and_give_no_figures(
     whole_session: tuple[Rig, MadeSession], tmp_path: Path
 ) -> None:
-    looks = looks_at(while_recording(whole_session, tmp_path, "block-2-loaded"), gap=True)
+    recorded = while_recording(whole_session, tmp_path, "block-2-loaded")
+    looks = looks_at(recorded, gap=True)
     assert looks[-1].missing == LOST
     assert not looks[-1].gains
 
@@ -200,10 +212,12 @@ def test_a_run_that_is_no_block_is_not_watched(
     whole_session: tuple[Rig, MadeSession], tmp_path: Path
 ) -> None:
     recorded = while_recording(whole_session, tmp_path, "block-1-bare")
-    facts = asdict(replace(recorded.facts, log=str(recorded.folder / "acceptance.mcap")))
+    log = str(recorded.folder / "acceptance.mcap")
+    facts = asdict(replace(recorded.facts, log=log))
     watch = BlockWatch(recorded.rig.cell, "disc", TARGET_PERCENT)
+    cell_event = CellEvent(1, None, EventKind.MOVE_END, 0, "")
     end = {
-        **asdict(CellEvent(1, None, EventKind.MOVE_END, 0, "")),
+        **asdict(cell_event),
         "kind": EventKind.MOVE_END.value,
     }
     for message in ({"run": facts}, {"events": [end]}):
@@ -216,20 +230,27 @@ def test_an_earlier_block_that_cannot_be_read_is_named(
 ) -> None:
     recorded = while_recording(whole_session, tmp_path, "block-2-loaded")
     (recorded.folder / "block-1-bare.mcap").write_bytes(b"damaged")
-    assert "an earlier block cannot be used" in looks_at(recorded)[-1].missing
+    last_look = looks_at(recorded)[-1]
+    assert "an earlier block cannot be used" in last_look.missing
 
 
 def test_a_look_is_said_once_unless_it_has_new_figures() -> None:
     waiting = replace(LOOK, missing="no payload")
     assert tells_something_new(waiting, None)
-    assert not tells_something_new(replace(waiting, move=4), waiting)
-    assert not tells_something_new(replace(waiting, block="block-3"), waiting)
-    assert tells_something_new(replace(waiting, missing="no moves"), waiting)
+    look = replace(waiting, move=4)
+    assert not tells_something_new(look, waiting)
+    changed_waiting = replace(waiting, block="block-3")
+    assert not tells_something_new(changed_waiting, waiting)
+    changed_waiting_look = replace(waiting, missing="no moves")
+    assert tells_something_new(changed_waiting_look, waiting)
     assert tells_something_new(FIGURES, waiting)
-    assert tells_something_new(replace(FIGURES, move=4), FIGURES)
-    assert not tells_something_new(replace(FIGURES, move=4, is_held_out=True), FIGURES)
+    changed_figure = replace(FIGURES, move=4)
+    assert tells_something_new(changed_figure, FIGURES)
+    changed_figure_look = replace(FIGURES, move=4, is_held_out=True)
+    assert not tells_something_new(changed_figure_look, FIGURES)
     held_out = replace(FIGURES, is_held_out=True)
-    assert not tells_something_new(replace(held_out, move=4), held_out)
+    changed_held_out = replace(held_out, move=4)
+    assert not tells_something_new(changed_held_out, held_out)
 
 
 def test_the_process_ends_with_its_feed(whole_session: tuple[Rig, MadeSession]) -> None:
@@ -237,7 +258,9 @@ def test_the_process_ends_with_its_feed(whole_session: tuple[Rig, MadeSession]) 
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     ours.close()
     with theirs:
-        follow_feed(theirs, BlockWatch(whole_session[0].cell, "disc", TARGET_PERCENT), _unexpected)
+        cell = whole_session[0].cell
+        watch = BlockWatch(cell, "disc", TARGET_PERCENT)
+        follow_feed(theirs, watch, _unexpected)
 
 
 def _unexpected(look: QuickLook) -> None:
@@ -276,16 +299,19 @@ def test_the_process_prints_a_look_after_a_move(
 
 
 def test_a_look_of_another_thread_is_published_with_the_next_samples(tmp_path: Path) -> None:
-    packets: Any = Packets(tmp_path / "cell.yaml")
+    cell_file = tmp_path / "cell.yaml"
+    packets: Any = Packets(cell_file)
     facts = RunFacts("id", None, ("J1",), 50.0, 1, [1.0], [1.0], [[1.0]], [0.0], None, {})
     packets.begin(facts, lambda: RunStatistics(0, 0, (), valid=True))
     thread = threading.Thread(target=packets.look, args=(FIGURES,))
     thread.start()
     thread.join()
     sent_before = len(packets.sent)
-    packets.sample(Sample(0, 0, (0,), (0,), (0,)))
+    sample = Sample(0, 0, (0,), (0,), (0,))
+    packets.sample(sample)
     texts = [json.loads(one[HEAD.size :]) for one in packets.sent[sent_before:] if one[0] == TEXT]
-    assert texts == [{"quick": asdict(FIGURES)}]
+    expected = [{"quick": asdict(FIGURES)}]
+    assert texts == expected
     packets.sample(Sample(1, 1, (0,), (0,), (0,)))
     assert sum(one[0] == TEXT for one in packets.sent[sent_before:]) == 1
     packets.close()

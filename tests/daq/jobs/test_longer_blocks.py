@@ -61,14 +61,20 @@ def _said(rig: Rig) -> list[dict[str, Any]]:
 def test_blocks_are_twice_as_long_where_the_asked_duration_has_no_room(
     tmp_path: Path, made_session: MadeSession
 ) -> None:
-    rig = _rig(tmp_path / "cell", made_session, 4.0 * BLOCK_S)
+    folder = tmp_path / "cell"
+    needed_s = 4.0 * BLOCK_S
+    rig = _rig(folder, made_session, needed_s)
     ended = run_session(rig)
     assert ended.outcome is Outcome.APPLIED
     state = _state(rig)
     assert state.block_s == 4.0 * BLOCK_S
-    assert [block.duration_s for block in state.blocks] == [4.0 * BLOCK_S] * len(FIRST_BLOCKS)
-    assert state.progress[-1].motion_s == 4.0 * BLOCK_S * len(FIRST_BLOCKS)
-    assert state.progress[-1].fitted_s == 4.0 * BLOCK_S * (len(FIRST_BLOCKS) - 1)
+    expected = [4.0 * BLOCK_S] * len(FIRST_BLOCKS)
+    duration_s = [block.duration_s for block in state.blocks]
+    assert duration_s == expected
+    motion_s = state.progress[-1].motion_s
+    assert motion_s == 4.0 * BLOCK_S * len(FIRST_BLOCKS)
+    fitted_s = state.progress[-1].fitted_s
+    assert fitted_s == 4.0 * BLOCK_S * (len(FIRST_BLOCKS) - 1)
     # Both doublings are of the first block; the later ones are asked for with the new length.
     said = _said(rig)
     assert [(one["asked_s"], one["duration_s"]) for one in said] == [(6.0, 12.0), (12.0, 24.0)]
@@ -82,41 +88,56 @@ def test_blocks_are_twice_as_long_where_the_asked_duration_has_no_room(
 def test_a_session_that_goes_on_keeps_the_length_of_its_blocks(
     tmp_path: Path, made_session: MadeSession
 ) -> None:
-    rig = _rig(tmp_path / "cell", made_session, 2.0 * BLOCK_S)
+    folder = tmp_path / "cell"
+    needed_s = 2.0 * BLOCK_S
+    rig = _rig(folder, made_session, needed_s)
 
     def stop_before(payload: str | None) -> None:
         if rig.session.state.runs:
             raise KeyboardInterrupt
 
+    operator = given_answers(rig, put=stop_before)
     with pytest.raises(KeyboardInterrupt):
-        run_session(rig, given_answers(rig, put=stop_before))
+        run_session(rig, operator)
     assert len(_state(rig).runs) == 1
     rig.clock.go_on(minutes=5)
     ended = run_session(rig)
     assert ended.outcome is Outcome.APPLIED
-    assert [block.duration_s for block in _state(rig).blocks] == [2.0 * BLOCK_S] * len(FIRST_BLOCKS)
+    blocks = _state(rig).blocks
+    duration_s = [block.duration_s for block in blocks]
+    expected = [2.0 * BLOCK_S] * len(FIRST_BLOCKS)
+    assert duration_s == expected
     assert len(_said(rig)) == 1
 
 
 def test_the_time_limit_counts_the_longer_blocks(tmp_path: Path, made_session: MadeSession) -> None:
-    rig = _rig(tmp_path / "cell", made_session, 2.0 * BLOCK_S)
-    run_session(rig, target_percent=0.1, time_limit_min=6.0 * BLOCK_S / 60.0)
-    assert len(_state(rig).blocks) == len(FIRST_BLOCKS)
+    folder = tmp_path / "cell"
+    needed_s = 2.0 * BLOCK_S
+    rig = _rig(folder, made_session, needed_s)
+    time_limit_min = 6.0 * BLOCK_S / 60.0
+    run_session(rig, target_percent=0.1, time_limit_min=time_limit_min)
+    blocks = _state(rig).blocks
+    assert len(blocks) == len(FIRST_BLOCKS)
     assert _state(rig).missing
 
 
 def test_blocks_are_at_most_eight_times_as_long(tmp_path: Path, made_session: MadeSession) -> None:
-    rig = _rig(tmp_path / "cell", made_session, 9.0 * BLOCK_S)
+    folder = tmp_path / "cell"
+    needed_s = 9.0 * BLOCK_S
+    rig = _rig(folder, made_session, needed_s)
     with pytest.raises(PlanTooShort, match="room for 4 moves"):
         run_session(rig)
-    assert [one["duration_s"] for one in _said(rig)] == [12.0, 24.0, 48.0]
+    duration_s = [one["duration_s"] for one in _said(rig)]
+    assert duration_s == [12.0, 24.0, 48.0]
     assert not rig.session.state.runs
 
 
 def test_a_rehearsal_finds_the_length_of_the_blocks(
     tmp_path: Path, made_session: MadeSession
 ) -> None:
-    rig = _rig(tmp_path / "cell", made_session, 2.0 * BLOCK_S)
+    folder = tmp_path / "cell"
+    needed_s = 2.0 * BLOCK_S
+    rig = _rig(folder, made_session, needed_s)
     record = rig.tools.record
 
     def slowly(request: RecordingRequest, **further: Any) -> Recorded:
@@ -129,5 +150,6 @@ def test_a_rehearsal_finds_the_length_of_the_blocks(
     rig.tools = replace(rig.tools, record=slowly)
     ended = run_session(rig, rehearse=True)
     assert ended.outcome is Outcome.APPLIED
-    assert _state(rig).block_s == 2.0 * BLOCK_S
+    block_s = _state(rig).block_s
+    assert block_s == 2.0 * BLOCK_S
     assert len(_said(rig)) == 1

@@ -70,8 +70,10 @@ def goes_on(rig: Rig, made: MadeSession) -> None:
     rig.tools = made.tools(rig)
     rig.clock.go_on(minutes=5)
     assert run_session(rig).exit_code == ExitCode.OK
-    assert [run.name for run in rig.session.state.runs] == [FIRST, LOADED, "block-3-held-out"]
-    assert [entry.action for entry in rig.audit].count(AuditAction.APPLIED) == 1
+    runs = rig.session.state.runs
+    assert [run.name for run in runs] == [FIRST, LOADED, "block-3-held-out"]
+    actions = [entry.action for entry in rig.audit]
+    assert actions.count(AuditAction.APPLIED) == 1
 
 
 def with_real_recorder(rig: Rig, made: MadeSession) -> None:
@@ -85,7 +87,8 @@ def test_an_axis_that_trips_ends_the_block_and_says_how_to_reset_it(
 ) -> None:
     rig = session_rig(tmp_path / "cell")
     with_real_recorder(rig, made_session)
-    with serving(rig, FaultSpec(FaultKind.EMERGENCY, 2, STRIKE, None, 0x7305)) as cell:
+    fault_spec = FaultSpec(FaultKind.EMERGENCY, 2, STRIKE, None, 0x7305)
+    with serving(rig, fault_spec) as cell:
         parts = ends_at(rig, DriveFault, ExitCode.DEVICE_FAULT, FIRST, "no block yet")
         assert powerless(cell)
     assert parts.error.startswith("J3 (node 3)")
@@ -123,7 +126,8 @@ def test_a_bus_that_goes_away_ends_the_block_and_says_what_to_check(
 def test_a_disk_that_fills_up_in_a_block_ends_it_and_nothing_moves_before_there_is_room(
     tmp_path: Path, made_session: MadeSession
 ) -> None:
-    rig = made_session_rig(tmp_path / "cell", made_session)
+    folder = tmp_path / "cell"
+    rig = made_session_rig(folder, made_session)
     copied = rig.tools.record
 
     def fills_up(request: RecordingRequest, **further: Any) -> Recorded:
@@ -153,7 +157,8 @@ def test_a_disk_that_fills_up_in_a_block_ends_it_and_nothing_moves_before_there_
 def test_a_block_with_losses_is_recorded_again_at_once_and_the_lossy_log_is_kept(
     tmp_path: Path, made_session: MadeSession
 ) -> None:
-    rig = made_session_rig(tmp_path / "cell", made_session)
+    folder = tmp_path / "cell"
+    rig = made_session_rig(folder, made_session)
     lossy_blocks = iter([LOADED])
     copied = rig.tools.record
 
@@ -161,9 +166,8 @@ def test_a_block_with_losses_is_recorded_again_at_once_and_the_lossy_log_is_kept
         recorded: Recorded = copied(request, **further)
         if request.out.stem != next(lossy_blocks, ""):
             return recorded
-        return replace(
-            recorded, log=replace(recorded.log, valid=False, reason="3 cycles lost", lost_cycles=3)
-        )
+        log = replace(recorded.log, valid=False, reason="3 cycles lost", lost_cycles=3)
+        return replace(recorded, log=log)
 
     def first_is_clean(request: RecordingRequest, **further: Any) -> Recorded:
         if request.out.stem == FIRST:
@@ -172,7 +176,8 @@ def test_a_block_with_losses_is_recorded_again_at_once_and_the_lossy_log_is_kept
 
     rig.tools = replace(rig.tools, record=first_is_clean)
     assert run_session(rig).exit_code == ExitCode.OK
-    (run,) = [run for run in rig.session.state.runs if run.name == LOADED]
+    runs = rig.session.state.runs
+    (run,) = [run for run in runs if run.name == LOADED]
     assert run.attempts == 2
     assert run.lost_cycles >= 3
     assert (rig.session.folder / f"{LOADED}-aside-1.mcap").exists()
@@ -185,15 +190,15 @@ def test_a_block_with_losses_is_recorded_again_at_once_and_the_lossy_log_is_kept
 def test_a_block_that_has_losses_each_time_ends_the_session_there(
     tmp_path: Path, made_session: MadeSession
 ) -> None:
-    rig = made_session_rig(tmp_path / "cell", made_session)
+    folder = tmp_path / "cell"
+    rig = made_session_rig(folder, made_session)
     copied = rig.tools.record
 
     def with_losses(request: RecordingRequest, **further: Any) -> Recorded:
         recorded: Recorded = copied(request, **further)
         is_lossy = request.out.stem == LOADED
-        return replace(
-            recorded, log=replace(recorded.log, valid=not is_lossy, reason="3 cycles lost")
-        )
+        log = replace(recorded.log, valid=not is_lossy, reason="3 cycles lost")
+        return replace(recorded, log=log)
 
     rig.tools = replace(rig.tools, record=with_losses)
     parts = ends_at(rig, RunInvalid, ExitCode.DATA_UNFIT, LOADED, FIRST)

@@ -24,7 +24,9 @@ DOCUMENT = Path(__file__).parents[3] / "docs" / "how-to" / "schedule-recalibrati
 
 
 def changed(tmp_path: Path, **section: Any) -> Path:
-    rig = make_rig(tmp_path / "cell", tmp_path / "plan.yaml", **section)
+    folder = tmp_path / "cell"
+    plan_file = tmp_path / "plan.yaml"
+    rig = make_rig(folder, plan_file, **section)
     return rig.cell_file
 
 
@@ -63,26 +65,32 @@ def test_what_is_not_so_is_refused(tmp_path: Path, section: dict[str, Any], mess
 
 
 def test_paths_are_meant_from_the_cell_file(tmp_path: Path) -> None:
+    runs = [{**RUN, "plan": None, "plan_file": "plans/a.yaml"}, LOADED, HELD_OUT]
     file = changed(
         tmp_path,
-        runs=[{**RUN, "plan": None, "plan_file": "plans/a.yaml"}, LOADED, HELD_OUT],
+        runs=runs,
         interlock={"file": "state/interlock"},
         metrics="../metrics",
     )
     section = load_cell(file).recalibration
     assert section is not None
-    assert section.runs[0].plan_file == (file.parent / "plans" / "a.yaml").resolve()
-    assert section.runs[1].plan == SeededPlan(seed=1, duration_s=40.0)
+    plans_folder = file.parent / "plans"
+    expected = (plans_folder / "a.yaml").resolve()
+    assert section.runs[0].plan_file == expected
+    seeded_plan = SeededPlan(seed=1, duration_s=40.0)
+    assert section.runs[1].plan == seeded_plan
     assert section.interlock.command is None
-    assert section.interlock.file == (file.parent / "state" / "interlock").resolve()
-    assert section.metrics == (file.parent.parent / "metrics").resolve()
-    assert section.folder == (file.parent / "demo.recalibration").resolve()
+    interlock_folder = file.parent / "state" / "interlock"
+    assert section.interlock.file == interlock_folder.resolve()
+    metrics_folder = file.parent.parent / "metrics"
+    assert section.metrics == metrics_folder.resolve()
+    demo_path = file.parent / "demo.recalibration"
+    assert section.folder == demo_path.resolve()
 
 
 def test_the_page_shows_every_key_and_its_example_is_one() -> None:
-    (example,) = re.findall(
-        r"```yaml\n(recalibration:\n.*?)```", DOCUMENT.read_text(encoding="utf-8"), re.DOTALL
-    )
+    text = DOCUMENT.read_text(encoding="utf-8")
+    (example,) = re.findall(r"```yaml\n(recalibration:\n.*?)```", text, re.DOTALL)
     TypeAdapter(RecalibrationSection).validate_json(
         json.dumps(yaml.safe_load(example)["recalibration"])
     )
@@ -94,7 +102,9 @@ def test_the_page_shows_every_key_and_its_example_is_one() -> None:
 def test_sessions_are_found_taken_up_and_removed_by_their_age(tmp_path: Path) -> None:
     made = []
     for week in range(6):
-        session = begin(tmp_path, BASIS, BEGAN + timedelta(days=7 * week))
+        days = 7 * week
+        began_now = BEGAN + timedelta(days=days)
+        session = begin(tmp_path, BASIS, began_now)
         outcome = (Outcome.APPLIED, Outcome.STOPPED)[week % 2]
         state = session.state.with_(outcome=outcome, ended=session.state.began)
         made.append(save(type(session)(session.folder, state)))
@@ -105,21 +115,30 @@ def test_sessions_are_found_taken_up_and_removed_by_their_age(tmp_path: Path) ->
     assert last_good(found) == made[4]
     now = BEGAN + timedelta(days=35)
     assert resumable_session(found, BASIS, now + timedelta(hours=1), 2.0) == made[5]
+    configuration_sha256 = "d" * 64
+    changed_basis = replace(BASIS, configuration_sha256=configuration_sha256)
+    plans_sha256 = "d" * 64
     for basis in (
-        replace(BASIS, configuration_sha256="d" * 64),
-        replace(BASIS, plans_sha256="d" * 64),
+        changed_basis,
+        replace(BASIS, plans_sha256=plans_sha256),
     ):
         assert resumable_session(found, basis, now + timedelta(hours=1), 2.0) is None
     for later_h in (3, -1):
         assert resumable_session(found, BASIS, now + timedelta(hours=later_h), 2.0) is None
-    assert resumable_session(found[:5], BASIS, made[4].began, 2.0) is None
+    began = made[4].began
+    assert resumable_session(found[:5], BASIS, began, 2.0) is None
     # The calibration of the third week is in force: its logs and signatures are what the controller
     # rests on.
-    fitted = Fitted(calibration_sha256="f" * 64, sentences=())
-    save(replace(made[2], state=made[2].state.with_(fitted=fitted)))
+    calibration_sha256 = "f" * 64
+    fitted = Fitted(calibration_sha256=calibration_sha256, sentences=())
+    changed_made = replace(made[2], state=made[2].state.with_(fitted=fitted))
+    save(changed_made)
     removed = remove_old(sessions(tmp_path), 1, {"f" * 64})
-    assert removed == tuple(session.folder for session in (made[0], made[1], made[3]))
-    assert [session.folder for session in sessions(tmp_path)] == [made[i].folder for i in (2, 4, 5)]
+    expected = tuple(session.folder for session in (made[0], made[1], made[3]))
+    assert removed == expected
+    folders = [session.folder for session in sessions(tmp_path)]
+    folders_expected = [made[i].folder for i in (2, 4, 5)]
+    assert folders == folders_expected
 
 
 def test_two_sessions_of_one_second_have_folders_of_their_own(tmp_path: Path) -> None:

@@ -43,7 +43,9 @@ BASIS = Basis("demo", "c" * 64, "b" * 64)
 
 
 def test_two_cells_of_one_folder_have_sessions_of_their_own(tmp_path: Path) -> None:
-    rig = make_rig(tmp_path / "cell", tmp_path / "plan.yaml")
+    folder = tmp_path / "cell"
+    plan_file = tmp_path / "plan.yaml"
+    rig = make_rig(folder, plan_file)
     other = rig.cell_file.with_name("other.yaml")
     shutil.copyfile(rig.cell_file, other)
     folders = [
@@ -55,23 +57,31 @@ def test_two_cells_of_one_folder_have_sessions_of_their_own(tmp_path: Path) -> N
 
 
 def test_a_cell_is_due_whatever_another_one_keeps_in_its_folder(tmp_path: Path, made: Made) -> None:
-    rig = made_rig(tmp_path / "cell", made, keep_sessions=1, every_h=1)
+    cell_folder = tmp_path / "cell"
+    rig = made_rig(cell_folder, made, keep_sessions=1, every_h=1)
     folder = rig.cells / "demo.recalibration"
     for minutes in range(3):
-        one = begin(folder, replace(BASIS, cell="another"), BEGAN - timedelta(minutes=30 - minutes))
-        save(replace(one, state=one.state.with_(outcome=Outcome.APPLIED, ended=one.state.began)))
+        now = BEGAN - timedelta(minutes=30 - minutes)
+        basis = replace(BASIS, cell="another")
+        one = begin(folder, basis, now)
+        state = one.state.with_(outcome=Outcome.APPLIED, ended=one.state.began)
+        save(replace(one, state=state))
     assert rig.job().outcome is Outcome.APPLIED
     rig.clock.go_on(hours=2)
     assert rig.job().outcome is Outcome.UNCHANGED
     assert len(sessions(folder, "another")) == 3
     assert len(sessions(folder)) == 3 + len(rig.sessions)
-    assert "last_success_timestamp_seconds" in (rig.cells / "drivegain_demo.prom").read_text()
+    drivegain_demo_path = rig.cells / "drivegain_demo.prom"
+    assert "last_success_timestamp_seconds" in drivegain_demo_path.read_text()
 
 
 def test_what_another_cell_keeps_is_not_removed(tmp_path: Path) -> None:
     for week in range(3):
         for cell in ("demo", "another"):
-            begin(tmp_path, replace(BASIS, cell=cell), BEGAN + timedelta(days=7 * week))
+            days = 7 * week
+            now = BEGAN + timedelta(days=days)
+            basis = replace(BASIS, cell=cell)
+            begin(tmp_path, basis, now)
     assert len(remove_old(sessions(tmp_path, "demo"), 1, ())) == 2
     assert (len(sessions(tmp_path, "demo")), len(sessions(tmp_path, "another"))) == (1, 3)
 
@@ -113,7 +123,9 @@ def test_no_one_waits_for_a_pipe_in_the_place_of_a_state(tmp_path: Path) -> None
 def test_a_file_in_the_place_of_the_folder_is_reported(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    rig = make_rig(tmp_path / "cell", tmp_path / "plan.yaml")
+    folder = tmp_path / "cell"
+    plan_file = tmp_path / "plan.yaml"
+    rig = make_rig(folder, plan_file)
     (rig.cells / "demo.recalibration").write_text("no folder")
     for verb in (
         ["history", str(rig.cell_file), "--verify", "--json"],
@@ -123,7 +135,8 @@ def test_a_file_in_the_place_of_the_folder_is_reported(
         output = capsys.readouterr()
         assert output.out == ""
         (line,) = output.err.splitlines()
-        assert "demo.recalibration" in json.dumps(json.loads(line))
+        text = json.dumps(json.loads(line))
+        assert "demo.recalibration" in text
         assert "not a directory" in line
 
 
@@ -152,15 +165,17 @@ def test_a_state_with_a_count_that_is_none_is_no_session(
 
 
 def test_a_calibration_of_other_logs_is_none_of_the_session(tmp_path: Path, made: Made) -> None:
-    rig = made_rig(tmp_path / "cell", made)
+    folder = tmp_path / "cell"
+    rig = made_rig(folder, made)
     rig.job()
     session = rig.session
     assert calibration_of_session(session) is not None
     first, *others = session.state.runs
-    for runs in ((first.model_copy(update={"sha256": "0" * 64}), *others), tuple(others)):
-        assert (
-            calibration_of_session(replace(session, state=session.state.with_(runs=runs))) is None
-        )
+    update = {"sha256": "0" * 64}
+    for runs in ((first.model_copy(update=update), *others), tuple(others)):
+        state = session.state.with_(runs=runs)
+        changed_session = replace(session, state=state)
+        assert calibration_of_session(changed_session) is None
 
 
 @pytest.mark.parametrize("key", ["began", "attempt_began", "ended"])
@@ -169,7 +184,8 @@ def test_a_calibration_of_other_logs_is_none_of_the_session(tmp_path: Path, made
 )
 def test_a_state_whose_times_are_none_is_no_session(tmp_path: Path, key: str, time: str) -> None:
     session = begin(tmp_path, BASIS, BEGAN)
-    state = json.loads((session.folder / STATE).read_text())
+    text = (session.folder / STATE).read_text()
+    state = json.loads(text)
     (session.folder / STATE).write_text(json.dumps({**state, key: time}))
     assert sessions(tmp_path) == ()
 
@@ -189,10 +205,12 @@ def test_any_time_in_a_state_is_judged_without_a_crash(began: datetime, later_s:
 def test_a_session_of_the_far_future_is_reported_and_does_not_end_all_calibrations(
     tmp_path: Path, made: Made
 ) -> None:
-    rig = made_rig(tmp_path / "cell", made)
-    foreign = begin(
-        rig.cells / "demo.recalibration", replace(BASIS, cell="demo"), BEGAN.replace(year=2099)
-    )
+    folder = tmp_path / "cell"
+    rig = made_rig(folder, made)
+    demo_path = rig.cells / "demo.recalibration"
+    basis = replace(BASIS, cell="demo")
+    now = BEGAN.replace(year=2099)
+    foreign = begin(demo_path, basis, now)
     ended = foreign.state.with_(
         outcome=Outcome.APPLIED, ended=BEGAN.isoformat(), attempt_began=BEGAN.isoformat()
     )
@@ -210,7 +228,8 @@ def test_a_session_of_the_far_future_is_reported_and_does_not_end_all_calibratio
 
 def test_a_person_reads_which_session_does_not_count(tmp_path: Path) -> None:
     present = begin(tmp_path, BASIS, BEGAN)
-    future = begin(tmp_path, BASIS, BEGAN + timedelta(days=730))
+    now = BEGAN + timedelta(days=730)
+    future = begin(tmp_path, BASIS, now)
     terminal = io.StringIO()
     story = Story(terminal, Form.TEXT, lambda: BEGAN)
     for _ in range(2):  # said once
@@ -230,7 +249,8 @@ def test_a_session_from_the_future_is_neither_removed_nor_taken_for_the_newest(
     by a wrong date, that is all there is.
     """
     made = [begin(tmp_path, BASIS, BEGAN + timedelta(days=7 * week)) for week in range(3)]
-    future = begin(tmp_path, BASIS, BEGAN + timedelta(days=730))
+    now = BEGAN + timedelta(days=730)
+    future = begin(tmp_path, BASIS, now)
     just_begun = tmp_path / "20260201T000000Z"
     just_begun.mkdir()
     counted = begun_until(sessions(tmp_path), BEGAN + timedelta(days=15))
@@ -252,11 +272,15 @@ def test_what_to_do_can_be_typed_in_any_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    target = PlannedWrite(file="gains.yaml", base_sha256="a" * 64, after_sha256="b" * 64)
+    base_sha256 = "a" * 64
+    after_sha256 = "b" * 64
+    target = PlannedWrite(file="gains.yaml", base_sha256=base_sha256, after_sha256=after_sha256)
     for outcome in (Outcome.PROPOSED, Outcome.APPLIED):
         session = begin(tmp_path, BASIS, BEGAN).update(target=target, outcome=outcome)
-        lines = to_do(Conclusion(outcome, 0, session, ""), Path("cells/demo.yaml"))
-        assert f" {tmp_path}/cells/demo.yaml" in lines[-1]
+        conclusion = Conclusion(outcome, 0, session, "")
+        lines = to_do(conclusion, Path("cells/demo.yaml"))
+        last_line = lines[-1]
+        assert f" {tmp_path}/cells/demo.yaml" in last_line
 
 
 def test_a_plain_name_is_its_own() -> None:

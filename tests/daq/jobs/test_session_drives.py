@@ -61,7 +61,8 @@ def actions_of(rig: Rig) -> list[AuditAction]:
 def test_gains_in_drives_are_written_read_back_and_accepted(
     tmp_path: Path, made_session: MadeSession
 ) -> None:
-    rig = drives_rig(tmp_path / "cell", made_session)
+    folder = tmp_path / "cell"
+    rig = drives_rig(folder, made_session)
     with serving(rig) as cell:
         assert run_session(rig).exit_code == ExitCode.OK
         for node, gain in zip(cell.nodes, made_session.calibration.gains, strict=True):
@@ -81,18 +82,20 @@ def test_gains_in_drives_are_written_read_back_and_accepted(
         "written to the controller's file"
     )
     assert len(history_of(rig.cell_file).events) == 1
-    page = (rig.session.folder / "report" / "report.html").read_text()
+    report_folder = rig.session.folder / "report"
+    page = (report_folder / "report.html").read_text()
     assert "to the drives; accepted on " in page
-    assert "J1, 2003h:01" in (rig.session.folder / "proposal.diff").read_text()
-    assert (f"drivegain rollback {rig.cell_file} --drives --yes") in (
-        rig.session.folder / "summary.txt"
-    ).read_text()
+    proposal_path = rig.session.folder / "proposal.diff"
+    assert "J1, 2003h:01" in proposal_path.read_text()
+    text = (rig.session.folder / "summary.txt").read_text()
+    assert (f"drivegain rollback {rig.cell_file} --drives --yes") in text
 
 
 def test_a_session_that_ends_after_the_write_to_drives_does_not_write_again(
     tmp_path: Path, made_session: MadeSession
 ) -> None:
-    rig = drives_rig(tmp_path / "cell", made_session)
+    folder = tmp_path / "cell"
+    rig = drives_rig(folder, made_session)
     tools = rig.tools
 
     def interrupted(*given: Any, **further: Any) -> Any:
@@ -113,7 +116,8 @@ def test_a_session_that_ends_after_the_write_to_drives_does_not_write_again(
 def test_drives_that_lost_their_gains_are_noticed_before_anything_moves(
     tmp_path: Path, made_session: MadeSession
 ) -> None:
-    rig = drives_rig(tmp_path / "cell", made_session)
+    folder = tmp_path / "cell"
+    rig = drives_rig(folder, made_session)
     tools = rig.tools
     with serving(rig) as cell:
         before = cell.nodes[1].read(0x2003, 1)
@@ -126,7 +130,8 @@ def test_drives_that_lost_their_gains_are_noticed_before_anything_moves(
         rig.tools = replace(tools, apply=lost)
         with pytest.raises(ControllerChanged, match="nothing has moved"):
             run_session(rig)
-    assert not (rig.session.folder / "acceptance.mcap").exists()
+    acceptance_path = rig.session.folder / "acceptance.mcap"
+    assert not acceptance_path.exists()
     assert AuditAction.ACCEPTED not in actions_of(rig)
 
 
@@ -134,15 +139,18 @@ def test_drives_that_refuse_to_save_are_written_with_apply_and_the_session_goes_
     tmp_path: Path, made_session: MadeSession
 ) -> None:
     """As `apply --drives --save-unknown` does it."""
-    rig = drives_rig(tmp_path / "cell", made_session, Mapping.UNKNOWN)
+    folder = tmp_path / "cell"
+    rig = drives_rig(folder, made_session, Mapping.UNKNOWN)
     with serving(rig):
         with pytest.raises(ParameterRefused, match="nothing was written"):
             run_session(rig)
         assert rig.session.state.outcome is Outcome.STOPPED
         file = rig.session.folder / "calibration.yaml"
         request = Request(load_calibration(file), rig.clock(), file=file, content=file.read_bytes())
-        with network_of(rig.cell, bus_address(rig.cell), Mapping.UNKNOWN) as network:
-            proposal = propose(DriveTarget(rig.cell, network, Saving.ANY), request)
+        address = bus_address(rig.cell)
+        with network_of(rig.cell, address, Mapping.UNKNOWN) as network:
+            target = DriveTarget(rig.cell, network, Saving.ANY)
+            proposal = propose(target, request)
             apply(proposal, rig.clock(), audit=rig.cells / "demo.audit.jsonl", who="Kim")
         assert run_session(rig).exit_code == ExitCode.OK
     assert (
@@ -150,27 +158,35 @@ def test_drives_that_refuse_to_save_are_written_with_apply_and_the_session_goes_
         == actions_of(rig).count(AuditAction.ACCEPTED)
         == 1
     )
-    page = (rig.session.folder / "report" / "report.html").read_text()
+    report_folder = rig.session.folder / "report"
+    page = (report_folder / "report.html").read_text()
     assert "by Kim to the drives; accepted on " in page
 
 
 def test_without_yes_the_drives_keep_their_gains_and_the_command_for_later_is_said(
     tmp_path: Path, made_session: MadeSession
 ) -> None:
-    rig = drives_rig(tmp_path / "cell", made_session)
+    folder = tmp_path / "cell"
+    rig = drives_rig(folder, made_session)
     with serving(rig) as cell:
-        assert run_session(rig, given_answers(rig, writes=False)).outcome is Outcome.PROPOSED
+        operator = given_answers(rig, writes=False)
+        assert run_session(rig, operator).outcome is Outcome.PROPOSED
         assert [entered_gain(node) for node in cell.nodes] == pytest.approx(NAMEPLATE)
-    assert " --drives --yes --base " in (rig.session.folder / "summary.txt").read_text()
+    summary_path = rig.session.folder / "summary.txt"
+    assert " --drives --yes --base " in summary_path.read_text()
 
 
 def test_a_job_without_an_operator_takes_no_gains_in_drives(
     tmp_path: Path, made_session: MadeSession
 ) -> None:
-    rig = drives_rig(tmp_path / "cell", made_session)
+    folder = tmp_path / "cell"
+    rig = drives_rig(folder, made_session)
     assert target_of(rig.cell).in_drives
-    assert not target_of(made_session_rig(tmp_path / "file", made_session).cell).in_drives
+    file_folder = tmp_path / "file"
+    cell = made_session_rig(file_folder, made_session).cell
+    assert not target_of(cell).in_drives
     with pytest.raises(ConfigurationInconsistent, match="drivegain calibrate"):
         file_of(rig.cell)
+    changed_cell = replace(rig.cell, controller=None)
     with pytest.raises(ConfigurationInconsistent, match="neither a file nor objects"):
-        target_of(replace(rig.cell, controller=None))
+        target_of(changed_cell)

@@ -48,22 +48,11 @@ def test_the_worst_gain_comes_first_with_what_it_lacks() -> None:
     journal.say(
         Level.INFO, "gains so far", gains=list(GAINS), blocks=3, motion_s=60.0, left_s=180.0
     )
-    title, worst, other, outlook = stream.getvalue().strip().splitlines()
+    written = stream.getvalue().strip()
+    title, worst, other, outlook = written.splitlines()
     assert title == "Gains after 3 blocks, 60 s of motion:"
-    assert worst.split() == [
-        "J6",
-        "6.79",
-        "Nm/A",
-        "±",
-        "1.00",
-        "%",
-        "not",
-        "yet:",
-        "2.0",
-        "×",
-        "the",
-        "target",
-    ]
+    expected = ["J6", "6.79", "Nm/A", "±", "1.00", "%", "not", "yet:", "2.0", "×", "the", "target"]
+    assert worst.split() == expected
     assert other.split() == ["J1", "33.9", "Nm/A", "±", "0.40", "%", "✓"]
     assert "J6 needs the longest: about 3 min more at this rate" in outlook
 
@@ -77,18 +66,21 @@ def test_why_the_worst_gain_is_worst_is_said_after_a_block() -> None:
     journal.say(
         Level.INFO, "gains so far", gains=list(explained), blocks=3, motion_s=60.0, left_s=100.0
     )
-    outlook = stream.getvalue().strip().splitlines()[-1]
+    lines = stream.getvalue().strip().splitlines()
+    outlook = lines[-1]
     assert "J6 needs the longest (its current is noisier than planned): about 100 s more" in outlook
 
 
 def quick(**changed: Any) -> str:
     """What a person reads of a look after a move."""
-    gains = [QuickGain("J6", "Nm/A", 6.79, 1.0, 0.5), QuickGain("J1", "Nm/A", 33.9, 0.4, 0.5)]
+    quick_gain = QuickGain("J6", "Nm/A", 6.79, 1.0, 0.5)
+    gains = [quick_gain, QuickGain("J1", "Nm/A", 33.9, 0.4, 0.5)]
     look = QuickLook(
         "block-4-loaded", 3, 14, 80.0, gains=gains, why="it needs more moves", left_s=240.0
     )
     journal, stream = story()
-    journal.say(Level.INFO, "quick estimate", **asdict(replace(look, **changed)))
+    changed_look = replace(look, **changed)
+    journal.say(Level.INFO, "quick estimate", **asdict(changed_look))
     return stream.getvalue()
 
 
@@ -116,7 +108,8 @@ def test_at_the_time_limit_it_is_said_what_would_help() -> None:
         missing="J6 1.02 %",
         would_help=("more time", "J6: mount a heavier body"),
     )
-    assert stream.getvalue().strip().splitlines() == [
+    lines = stream.getvalue().strip().splitlines()
+    assert lines == [
         "The time is up. Not reached: J6 1.02 %.",
         "What would help:",
         "  more time",
@@ -127,7 +120,8 @@ def test_at_the_time_limit_it_is_said_what_would_help() -> None:
 def test_time_that_is_left_is_that_of_the_worst_gain() -> None:
     """σ twice the target needs four times the motion, three times of it still to come."""
     gains = [GainSoFar.model_validate(gain) for gain in GAINS]
-    cell = load_cell(shipped_configurations() / "cells" / "demo.yaml")
+    path = shipped_configurations() / "cells" / "demo.yaml"
+    cell = load_cell(path)
     blocks = [
         Block(
             name=f"block-{number}-{kind}",
@@ -155,7 +149,8 @@ def test_a_warning_is_said_once_and_what_is_for_programs_never() -> None:
         journal.say(Level.WARNING, "warning of the recorder", text="no rated torque")
     journal.say(Level.INFO, "mounted", payload="disc")
     journal.say(Level.ERROR, "something new", text="with its reason\x1b[2J")
-    assert stream.getvalue().splitlines() == [
+    lines = stream.getvalue().splitlines()
+    assert lines == [
         "! no rated torque",
         "! something new: with its reason\\x1b[2J",
     ]
@@ -173,7 +168,8 @@ def test_every_sentence_is_one_that_a_session_says(whole_session: tuple[Rig, Mad
     of_journal = {"time", "level", "event", "session", "step"}
     for event in rig.events:
         fields = {key: value for key, value in event.items() if key not in of_journal}
-        journal.say(Level[event["level"].upper()], event["event"], **fields)
+        level = event["level"].upper()
+        journal.say(Level[level], event["event"], **fields)
     text = stream.getvalue()
     assert "Gains after 3 blocks" in text
     assert "Every gain is within ± 5 %" in text
@@ -191,7 +187,8 @@ def test_every_sentence_is_one_that_a_session_says(whole_session: tuple[Rig, Mad
     # A session that reaches its target has no end of its time, and looks after a move are not of
     # the session itself.
     elsewhere = {"quick estimate", "time is up"}
-    assert set(PARAGRAPHS) - elsewhere <= {event["event"] for event in rig.events}
+    events = {event["event"] for event in rig.events}
+    assert set(PARAGRAPHS) - elsewhere <= events
     assert not set(PARAGRAPHS) & set(SENTENCES)
 
 
@@ -304,14 +301,16 @@ def test_the_next_step_after_an_error_is_what_the_same_command_does(
 def test_the_console_shows_where_a_session_is_and_how_its_precision_grew(
     tmp_path: Path, made_session: MadeSession
 ) -> None:
-    rig = made_session_rig(tmp_path / "cell", made_session)
+    cell_folder = tmp_path / "cell"
+    rig = made_session_rig(cell_folder, made_session)
     results = Results(rig.cell_file, rig.cell)
     assert results.document()["guided"] is None
     run_session(rig)
     shown = results.document()
     assert shown["problems"] == []
     assert shown["guided"]["stage"] == "ended"
-    assert shown["guided"]["acceptance"]["accepted"] is True
+    acceptance = shown["guided"]["acceptance"]
+    assert acceptance["accepted"] is True
     precision = shown["guided"]["precision"]
     assert precision["left_s"] == 0.0
     (progress,) = precision["progress"]
@@ -320,7 +319,11 @@ def test_the_console_shows_where_a_session_is_and_how_its_precision_grew(
     assert len(progress["std_percent"]) == len(precision["axes"]) == 6
     assert precision["worst"] in precision["axes"]
     assert shown["session"]["kind"] == "Session"
-    waiting = state(runs=(_run("block-1-bare"),))
+    runs = (_run("block-1-bare"),)
+    waiting = state(runs=runs)
     folder = rig.session.folder
-    save(Session(folder, waiting.model_copy(update={"session": folder.name})))
-    assert results.document()["guided"]["next_step"].startswith("DISC (4.59 kg) on the flange")
+    update = {"session": folder.name}
+    session = Session(folder, waiting.model_copy(update=update))
+    save(session)
+    guided = results.document()["guided"]
+    assert guided["next_step"].startswith("DISC (4.59 kg) on the flange")

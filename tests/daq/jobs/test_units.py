@@ -24,7 +24,9 @@ NAME = "drivegain-recalibrate-demo"
 
 @pytest.fixture
 def rig(tmp_path: Path) -> Rig:
-    return make_rig(tmp_path / "a cell", tmp_path / "plan.yaml", max_duration_min=30)
+    folder = tmp_path / "a cell"
+    plan_file = tmp_path / "plan.yaml"
+    return make_rig(folder, plan_file, max_duration_min=30)
 
 
 def installation(rig: Rig, *, user: bool = False, schedule: str = "weekly") -> Installation:
@@ -41,20 +43,22 @@ def read(text: str) -> configparser.ConfigParser:
 def test_the_timer_never_makes_up_for_a_date_and_the_service_bounds_the_job(rig: Rig) -> None:
     section = rig.cell.recalibration
     assert section is not None
-    service, timer = (read(unit.text) for unit in units_of(rig.cell, section, installation(rig)))
+    units = units_of(rig.cell, section, installation(rig))
+    service, timer = (read(unit.text) for unit in units)
     assert timer["Timer"]["Persistent"] == "false"
     assert timer["Timer"]["OnCalendar"] == "weekly"
     assert service["Service"]["Type"] == "oneshot"
     assert service["Service"]["Restart"] == "no"
     assert service["Service"]["KillSignal"] == "SIGTERM"
-    assert float(service["Service"]["TimeoutStartSec"]) > 30 * 60
-    assert service["Service"]["SuccessExitStatus"] == str(ExitCode.PROPOSED.value)
+    timeoutstartsec = float(service["Service"]["TimeoutStartSec"])
+    assert timeoutstartsec > 30 * 60
+    expected = str(ExitCode.PROPOSED.value)
+    assert service["Service"]["SuccessExitStatus"] == expected
     assert "AF_CAN" in service["Service"]["RestrictAddressFamilies"]
     assert "PrivateTmp" not in service["Service"]
-    assert (
-        "User"
-        not in read(units_of(rig.cell, section, installation(rig, user=True))[0].text)["Service"]
-    )
+    first_unit = units_of(rig.cell, section, installation(rig, user=True))[0]
+    text = first_unit.text
+    assert "User" not in read(text)["Service"]
 
 
 def test_what_is_written_through_a_link_is_writable_to_the_service(
@@ -67,7 +71,8 @@ def test_what_is_written_through_a_link_is_writable_to_the_service(
     rig.controller.symlink_to(elsewhere / "demo.yaml")
     section = rig.cell.recalibration
     assert section is not None
-    service = units_of(rig.cell, section, installation(rig))[0].text
+    units = units_of(rig.cell, section, installation(rig))
+    service = units[0].text
     assert f'ReadWritePaths="-{elsewhere}"' in service.splitlines()
 
 
@@ -106,12 +111,13 @@ def test_systemd_takes_them(rig: Rig, tmp_path: Path, user: bool) -> None:
     for unit in units:
         (tmp_path / unit.name).write_text(unit.text, encoding="utf-8")
     command = ["systemd-analyze", *(["--user"] if user else []), "--man=no", "verify"]
+    env = {**os.environ, "XDG_RUNTIME_DIR": str(tmp_path)}
     done = subprocess.run(
         [*command, *(str(tmp_path / unit.name) for unit in units)],
         capture_output=True,
         text=True,
         check=False,
-        env={**os.environ, "XDG_RUNTIME_DIR": str(tmp_path)},
+        env=env,
     )
     said = done.stdout + done.stderr
     if "Failed to initialize manager" in said:
@@ -135,18 +141,22 @@ def test_a_dry_run_shows_and_yes_writes_and_nothing_foreign_is_replaced(
     assert main([*command, "--yes"]) == ExitCode.OK
     shown = capsys.readouterr().out
     assert f"systemctl enable --now {NAME}.timer" in shown
+    changed_shown = shown.replace("'", "")
     assert (f"systemctl link '{folder}/{NAME}.service' '{folder}/{NAME}.timer'").replace(
         "'", ""
-    ) in shown.replace("'", "")
-    assert sorted(path.name for path in folder.iterdir()) == [f"{NAME}.service", f"{NAME}.timer"]
+    ) in changed_shown
+    expected = [f"{NAME}.service", f"{NAME}.timer"]
+    assert sorted(path.name for path in folder.iterdir()) == expected
     assert main([*command, "--yes", "--schedule", "daily"]) == ExitCode.OK
-    assert "OnCalendar=daily" in (folder / f"{NAME}.timer").read_text()
+    text = (folder / f"{NAME}.timer").read_text()
+    assert "OnCalendar=daily" in text
     (folder / f"{NAME}.timer").write_text("[Timer]\nOnCalendar=yearly\n")
     before = (folder / f"{NAME}.service").read_bytes()
     assert main([*command, "--yes"]) == ExitCode.USAGE
     assert "did not write" in capsys.readouterr().err
     assert (folder / f"{NAME}.timer").read_text() == "[Timer]\nOnCalendar=yearly\n"
-    assert (folder / f"{NAME}.service").read_bytes() == before
+    content = (folder / f"{NAME}.service").read_bytes()
+    assert content == before
 
 
 def test_a_unit_of_an_earlier_version_is_replaced(
@@ -159,9 +169,8 @@ def test_a_unit_of_an_earlier_version_is_replaced(
     service = folder / f"{NAME}.service"
     now = service.read_text(encoding="utf-8")
     assert now.startswith("# Made by `drivegain schedule`, which may replace this file.\n")
-    service.write_text(
-        now.replace("`drivegain schedule`", "`drivegain install-units`", 1), encoding="utf-8"
-    )
+    changed_now = now.replace("`drivegain schedule`", "`drivegain install-units`", 1)
+    service.write_text(changed_now, encoding="utf-8")
     assert main(command) == ExitCode.OK
     assert service.read_text(encoding="utf-8") == now
 
@@ -192,7 +201,8 @@ def test_a_word_means_the_same_date_for_cron_and_for_systemd(
     rig: Rig, word: str, minute: str, hour: str, day_of_month: str, day_of_week: str
 ) -> None:
     fields = cron_line(installation(rig, schedule=word)).split()[:5]
-    assert fields == [minute, hour, day_of_month, "*", day_of_week]
+    expected = [minute, hour, day_of_month, "*", day_of_week]
+    assert fields == expected
 
 
 def test_names_and_paths_cannot_say_more_than_they_are(rig: Rig) -> None:
@@ -207,11 +217,13 @@ def test_names_and_paths_cannot_say_more_than_they_are(rig: Rig) -> None:
         for name in ("Пресс 4", "Робот 4", "press 4", "press-4")
     }
     assert len(others) == 4
-    service = read(units_of(named, section, wanted)[0].text)["Service"]
+    text = units_of(named, section, wanted)[0].text
+    service = read(text)["Service"]
     assert service["ExecStart"] == (
         '/usr/bin/true recalibrate --cell "/cells/100 %% $$HOME/it\'s.yaml"'
     )
-    assert units_of(named, section, wanted)[0].text.count("\nExecStart=") == 1
+    first_unit = units_of(named, section, wanted)[0]
+    assert first_unit.text.count("\nExecStart=") == 1
     assert cron_line(wanted).endswith("--cell '/cells/100 \\% $HOME/it'\"'\"'s.yaml'")
 
 
@@ -227,7 +239,8 @@ def test_the_unit_of_another_cell_and_a_pipe_are_left_alone(
     capsys.readouterr()
     assert main([*command, str(other)]) == ExitCode.USAGE
     assert "the unit of another cell file" in capsys.readouterr().err
-    assert (folder / f"{NAME}.service").read_bytes() == before
+    content = (folder / f"{NAME}.service").read_bytes()
+    assert content == before
     (folder / f"{NAME}.service").unlink()
     os.mkfifo(folder / f"{NAME}.service")
     assert main([*command, str(rig.cell_file)]) == ExitCode.USAGE

@@ -21,13 +21,16 @@ from tests.drivers.scripted import FakeClock, ScriptedBus
 def test_a_dry_run_says_what_a_job_would_do(
     tmp_path: Path, short_plan: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    rig = make_rig(tmp_path / "cell", short_plan)
+    folder = tmp_path / "cell"
+    rig = make_rig(folder, short_plan)
     command = ["recalibrate", "--cell", str(rig.cell_file), "--dry-run"]
     with serving(rig):
         assert main([*command, "--json"]) == ExitCode.OK
         captured = capsys.readouterr()
-        assert json.loads(captured.out)["steps"][0] == "mount none, record bare-1"
-        assert [json.loads(line)["level"] for line in captured.err.splitlines()] == ["info", "info"]
+        steps = json.loads(captured.out)["steps"]
+        assert steps[0] == "mount none, record bare-1"
+        levels = [json.loads(line)["level"] for line in captured.err.splitlines()]
+        assert levels == ["info", "info"]
         assert main(command) == ExitCode.OK
     assert "a new session" in capsys.readouterr().out
     assert not (rig.cells / "recalibration").exists()
@@ -36,13 +39,16 @@ def test_a_dry_run_says_what_a_job_would_do(
 def test_a_job_that_is_held_says_so_in_its_exit_code_and_in_json_alone(
     tmp_path: Path, short_plan: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    rig = make_rig(tmp_path / "cell", short_plan)
+    folder = tmp_path / "cell"
+    rig = make_rig(folder, short_plan)
     rig.closed.unlink()
     assert main(["recalibrate", "--cell", str(rig.cell_file)]) == ExitCode.NOT_RELEASED
     captured = capsys.readouterr()
     events = [json.loads(line) for line in captured.err.splitlines()]
-    assert events[-1]["error"] == "NotReleased"
-    assert events[-1]["level"] == "error"
+    last_event = events[-1]
+    assert last_event["error"] == "NotReleased"
+    level = events[-1]["level"]
+    assert level == "error"
     assert captured.out == ""
     assert main(["recalibrate", "--cell", str(rig.cell_file), "--json"]) == ExitCode.NOT_RELEASED
     assert rig.session.state.attempt == 2
@@ -54,7 +60,8 @@ def test_a_person_at_a_terminal_reads_what_to_do(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    rig = make_rig(tmp_path / "cell", short_plan)
+    folder = tmp_path / "cell"
+    rig = make_rig(folder, short_plan)
     rig.closed.unlink()
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
     assert main(["recalibrate", "--cell", str(rig.cell_file)]) == ExitCode.NOT_RELEASED
@@ -67,14 +74,16 @@ def test_a_person_at_a_terminal_reads_what_to_do(
 def test_a_cell_without_the_section_names_what_it_lacks(
     tmp_path: Path, checkout: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    cell = checkout / "configs" / "cells" / "demo.yaml"
+    cells_folder = checkout / "configs" / "cells"
+    cell = cells_folder / "demo.yaml"
     for verb in ("recalibrate", "schedule", "install-units"):
         assert main([verb, "--cell", str(cell)]) == ExitCode.CONFIGURATION
         assert "recalibration" in capsys.readouterr().err
 
 
 def masses(cell: SimulatedCell) -> float:
-    return float(sum(inertia.mass for inertia in cell.plant._model.inertias))
+    inertias = cell.plant._model.inertias
+    return float(sum(inertia.mass for inertia in inertias))
 
 
 def test_the_simulated_payload_changes_with_the_file_but_never_under_power(

@@ -40,7 +40,8 @@ class _Drives:
 
     @property
     def waited_s(self) -> float:
-        return 1e-9 * (self.link.now_ns - self.began_ns)
+        elapsed_ns = self.link.now_ns - self.began_ns
+        return 1e-9 * elapsed_ns
 
     def statuswords(self) -> tuple[int, int]:
         if self.waited_s < self.powered_s:
@@ -49,7 +50,8 @@ class _Drives:
 
 
 def _left_after_wait(drives: _Drives) -> tuple[tuple[object, int], ...]:
-    left = _wait(cast(CanopenNetwork, drives), (("J2", POWERED),))  # type: ignore[arg-type]
+    network = cast(CanopenNetwork, drives)
+    left = _wait(network, (("J2", POWERED),))  # type: ignore[arg-type]
     return cast(tuple[tuple[object, int], ...], left)
 
 

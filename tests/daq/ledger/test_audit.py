@@ -72,7 +72,8 @@ def _filled(path: Path, count: int = 6) -> tuple[AuditEntry, ...]:
 
 
 def _judge(lines: list[bytes]) -> audit.AuditVerdict:
-    return judge_chain(b"".join(line + b"\n" for line in lines), lambda _: None)
+    content = b"".join(line + b"\n" for line in lines)
+    return judge_chain(content, lambda _: None)
 
 
 def _lines(path: Path) -> list[bytes]:
@@ -96,7 +97,8 @@ def test_what_is_appended_is_read_back_and_the_chain_holds(
         assert read(path) == ()
         written = [append(path, a, at=NOW, who=w, subject=s, details=d) for a, w, s, d in asked]
         assert list(read(path)) == written
-        assert [one.number for one in written] == list(range(1, len(asked) + 1))
+        expected = list(range(1, len(asked) + 1))
+        assert [one.number for one in written] == expected
         for one, (action, who, subject, details) in zip(written, asked, strict=True):
             assert (one.action, one.who, one.subject, one.details) == (
                 action,
@@ -104,23 +106,23 @@ def test_what_is_appended_is_read_back_and_the_chain_holds(
                 subject,
                 details,
             )
-        verdict = verify(path, heads=[one.sha256 for one in written])
+        heads = [one.sha256 for one in written]
+        verdict = verify(path, heads=heads)
         assert verdict.holds
         assert verdict.broken is None
         assert verdict.entries == tuple(written)
 
 
 def test_the_digest_is_sha256_of_canonical_json_and_covers_the_one_before(tmp_path: Path) -> None:
-    first, second = _filled(tmp_path / "a", 2)
-    tree = json.loads(_lines(tmp_path / "a")[1])
+    path = tmp_path / "a"
+    first, second = _filled(path, 2)
+    a_folder = tmp_path / "a"
+    tree = json.loads(_lines(a_folder)[1])
     assert tree.pop("sha256") == second.sha256
     assert tree["previous"] == first.sha256
-    assert (
-        second.sha256
-        == hashlib.sha256(
-            json.dumps(tree, sort_keys=True, separators=(",", ":")).encode()
-        ).hexdigest()
-    )
+    text = json.dumps(tree, sort_keys=True, separators=(",", ":"))
+    expected = hashlib.sha256(text.encode()).hexdigest()
+    assert second.sha256 == expected
     assert first.previous == "0" * 64
 
 
@@ -149,8 +151,10 @@ def test_removed_lines_are_found_where_they_were(line: int, count: int) -> None:
         lines = _lines(folder / "a")
     last = min(line + count, 5)
     verdict = _judge(lines[:line] + lines[last:])
-    assert [(flaw.line, flaw.flaw) for flaw in verdict.flaws] == [(line + 1, Flaw.REMOVED)]
-    assert str(line + 1) in verdict.flaws[0].says
+    expected = [(line + 1, Flaw.REMOVED)]
+    assert [(flaw.line, flaw.flaw) for flaw in verdict.flaws] == expected
+    line_text = str(line + 1)
+    assert line_text in verdict.flaws[0].says
 
 
 @given(st.permutations(range(6)))
@@ -161,7 +165,8 @@ def test_a_changed_order_is_found(order: list[int]) -> None:
     verdict = _judge([lines[k] for k in order])
     first = next((place for place, k in enumerate(order) if place != k), None)
     assert verdict.broken == (None if first is None else first + 1)
-    assert {flaw.flaw for flaw in verdict.flaws} <= {Flaw.MOVED}
+    flaws = {flaw.flaw for flaw in verdict.flaws}
+    assert flaws <= {Flaw.MOVED}
 
 
 @given(place=st.integers(0, 6), copied=st.integers(0, 5))
@@ -171,7 +176,8 @@ def test_a_line_that_was_added_twice_is_found(place: int, copied: int) -> None:
         lines = _lines(folder / "a")
     verdict = _judge([*lines[:place], lines[copied], *lines[place:]])
     assert not verdict.holds
-    assert Flaw.ADDED in {flaw.flaw for flaw in verdict.flaws}
+    flaws = {flaw.flaw for flaw in verdict.flaws}
+    assert Flaw.ADDED in flaws
 
 
 @given(place=st.integers(0, 4))
@@ -182,8 +188,10 @@ def test_a_forged_entry_with_a_right_digest_breaks_the_link(place: int) -> None:
     forged = entry(
         was.number, was.at, "another person", was.action, was.subject, was.details, was.previous
     )
-    verdict = _judge([encode(forged if one is was else one) for one in entries])
-    assert [(flaw.line, flaw.flaw) for flaw in verdict.flaws] == [(place + 1, Flaw.EDITED)]
+    lines = [encode(forged if one is was else one) for one in entries]
+    verdict = _judge(lines)
+    expected = [(place + 1, Flaw.EDITED)]
+    assert [(flaw.line, flaw.flaw) for flaw in verdict.flaws] == expected
     # Put between two others, it is one entry of that number too many.
     verdict = _judge([encode(one) for one in (*entries[:place], forged, *entries[place:])])
     assert not verdict.holds
@@ -191,13 +199,21 @@ def test_a_forged_entry_with_a_right_digest_breaks_the_link(place: int) -> None:
 
 def test_a_cut_off_tail_is_found_by_who_noted_an_entry_elsewhere(tmp_path: Path) -> None:
     entries = _filled(tmp_path / "a")
-    content = b"".join(line + b"\n" for line in _lines(tmp_path / "a")[:4])
+    path = tmp_path / "a"
+    content = b"".join(line + b"\n" for line in _lines(path)[:4])
     (tmp_path / "a").write_bytes(content)
     assert verify(tmp_path / "a").holds
-    verdict = verify(tmp_path / "a", heads=[entries[2].sha256, entries[5].sha256])
-    assert [(flaw.line, flaw.flaw) for flaw in verdict.flaws] == [(5, Flaw.CUT_OFF)]
-    assert entries[5].sha256[:12] in verdict.flaws[0].says
-    assert verify(tmp_path / "none", heads=[entries[0].sha256]).broken == 1
+    heads = [entries[2].sha256, entries[5].sha256]
+    a_folder = tmp_path / "a"
+    verdict = verify(a_folder, heads=heads)
+    expected = [(5, Flaw.CUT_OFF)]
+    assert [(flaw.line, flaw.flaw) for flaw in verdict.flaws] == expected
+    says = verdict.flaws[0].says
+    sha256 = entries[5].sha256
+    assert sha256[:12] in says
+    none_folder = tmp_path / "none"
+    broken = verify(none_folder, heads=[entries[0].sha256]).broken
+    assert broken == 1
 
 
 @given(st.lists(st.floats(0, 1), min_size=1, max_size=4), st.data())
@@ -224,12 +240,16 @@ def test_what_killed_writers_leave_stays_and_is_reported(
         assert read(path)[-1] == last
         verdict = verify(path)
         assert verdict.holds
-        assert [one.number for one in verdict.entries] == list(range(1, len(verdict.entries) + 1))
+        expected = list(range(1, len(verdict.entries) + 1))
+        numbers = [one.number for one in verdict.entries]
+        assert numbers == expected
         # A fragment that is removed or changed after it was reported is missed.
         lines = _lines(path)
         for torn in verdict.torn:
-            assert not _judge(lines[: torn - 1] + lines[torn:]).holds
-            place = data.draw(st.integers(0, max(len(lines[torn - 1]) - 1, 0)))
+            holds = _judge(lines[: torn - 1] + lines[torn:]).holds
+            assert not holds
+            largest_line_count = max(len(lines[torn - 1]) - 1, 0)
+            place = data.draw(st.integers(0, largest_line_count))
             changed = lines[torn - 1][:place] + b"#" + lines[torn - 1][place:]
             assert not _judge([*lines[: torn - 1], changed, *lines[torn:]]).holds
 
@@ -243,11 +263,11 @@ def test_zeros_after_a_power_cut_are_an_unfinished_line(tmp_path: Path) -> None:
     _filled(path, 1)
     verdict = verify(path)
     assert verdict.holds
-    assert [one.action for one in verdict.entries][2:] == [
-        AuditAction.TORN_LINE,
-        AuditAction.PROPOSED,
-    ]
-    assert verdict.entries[2].details["torn_bytes"] == 100
+    actions = [one.action for one in verdict.entries]
+    expected = [AuditAction.TORN_LINE, AuditAction.PROPOSED]
+    assert actions[2:] == expected
+    details = verdict.entries[2].details
+    assert details["torn_bytes"] == 100
 
 
 @pytest.mark.parametrize(
@@ -283,9 +303,9 @@ def test_what_is_left_of_a_first_entry_is_no_other_file(tmp_path: Path) -> None:
     for length in range(len(whole) - 1):
         path = tmp_path / str(length)
         path.write_bytes(whole[:length])
-        assert append(
-            path, AuditAction.APPLIED, at=NOW, who="", subject="", details={}
-        ).number == 1 + (length > 0)
+        number = append(path, AuditAction.APPLIED, at=NOW, who="", subject="", details={}).number
+        expected = 1 + (length > 0)
+        assert number == expected
         assert verify(path).holds
 
 
@@ -334,48 +354,59 @@ def test_of_a_write_without_an_end_the_file_reports_which_it_is(
     if now is not None:
         file.write_bytes(now)
     first = _write(begun, path, file, b"old", b"new")
-    assert [(one.begun, one.content) for one in verify(path).open_writes] == [(first, content)]
+    open_writes = verify(path).open_writes
+    assert [(one.begun, one.content) for one in open_writes] == [(first, content)]
     # The next write on the same file saw what was there, whatever is there by now.
-    _write(begun, path, tmp_path / "y.yaml", b"other", b"file")
+    subject = tmp_path / "y.yaml"
+    _write(begun, path, subject, b"other", b"file")
     second = _write(begun, path, file, b"new", b"newest")
     file.write_bytes(b"newest")
+    details = {"begun": second.number}
     append(
         path,
         AuditAction.APPLIED,
         at=NOW,
         who="K.",
         subject=str(file),
-        details={"begun": second.number},
+        details=details,
     )
     found = {one.begun.number: one.content for one in verify(path).open_writes}
-    assert found == {1: Content.AFTER, 2: Content.OTHER}
+    expected = {1: Content.AFTER, 2: Content.OTHER}
+    assert found == expected
     (tmp_path / "y.yaml").mkdir()  # unreadable
     assert {one.begun.number: one.content for one in verify(path).open_writes}[2] is Content.UNKNOWN
 
 
 @pytest.mark.parametrize("end", [AuditAction.APPLIED, AuditAction.ROLLED_BACK, AuditAction.FAILED])
 def test_a_write_with_an_end_is_not_open(tmp_path: Path, end: AuditAction) -> None:
-    begun = _write(AuditAction.APPLY_BEGUN, tmp_path / "a", tmp_path / "x", b"old", b"new")
+    path = tmp_path / "a"
+    subject = tmp_path / "x"
+    begun = _write(AuditAction.APPLY_BEGUN, path, subject, b"old", b"new")
+    a_folder = tmp_path / "a"
+    details = {"begun": begun.number}
     append(
-        tmp_path / "a",
+        a_folder,
         end,
         at=NOW,
         who="K.",
         subject=begun.subject,
-        details={"begun": begun.number},
+        details=details,
     )
-    assert verify(tmp_path / "a").open_writes == ()
+    open_writes = verify(tmp_path / "a").open_writes
+    assert open_writes == ()
 
 
 def test_no_number_that_is_not_finite_gets_in(tmp_path: Path) -> None:
+    path = tmp_path / "a"
+    details = {"gain": math.nan}
     with pytest.raises(ValueError, match="JSON"):
         append(
-            tmp_path / "a",
+            path,
             AuditAction.PROPOSED,
             at=NOW,
             who="",
             subject="",
-            details={"gain": math.nan},
+            details=details,
         )
     assert (tmp_path / "a").read_bytes() == b""
 
@@ -387,7 +418,8 @@ def test_what_is_no_regular_file_is_refused_and_no_one_waits(tmp_path: Path) -> 
             read(path)
         with pytest.raises((AuditUnusable, PermissionError)):
             _filled(path, 1)
-    (tmp_path / "dangling").symlink_to(tmp_path / "gone" / "a")
+    a_folder = tmp_path / "gone" / "a"
+    (tmp_path / "dangling").symlink_to(a_folder)
     for refused in (lambda path: _filled(path, 1), read, verify):
         with pytest.raises(AuditUnusable, match="where there is no file"):
             refused(tmp_path / "dangling")
@@ -403,11 +435,13 @@ def test_the_entry_is_on_the_disk_and_so_is_the_folder_of_a_new_audit(
     flushed: list[str] = []
 
     def noted(descriptor: int) -> None:
-        flushed.append(str(Path(f"/proc/self/fd/{descriptor}").readlink()))
+        path = Path(f"/proc/self/fd/{descriptor}")
+        flushed.append(str(path.readlink()))
 
     monkeypatch.setattr(os, "fsync", noted)
     _filled(tmp_path / "a", 2)
-    assert flushed == [str(tmp_path / "a"), str(tmp_path), str(tmp_path / "a")]
+    expected = [str(tmp_path / "a"), str(tmp_path), str(tmp_path / "a")]
+    assert flushed == expected
 
 
 def _append_many(path: Path, who: str) -> None:
@@ -428,7 +462,8 @@ def test_many_writers_make_one_chain(tmp_path: Path) -> None:
     assert verdict.holds
     assert len(verdict.entries) == 100
     for who in "0123":
-        assert [one.details["k"] for one in verdict.entries if one.who == who] == list(range(25))
+        expected = list(range(25))
+        assert [one.details["k"] for one in verdict.entries if one.who == who] == expected
 
 
 def test_a_lock_that_is_never_given_back_is_reported(
@@ -448,8 +483,10 @@ def test_an_entry_cannot_hide_a_missing_torn_line(tmp_path: Path) -> None:
         stream.write(b'{"action":')
     _filled(tmp_path / "a", 1)
     lines = _lines(tmp_path / "a")
-    assert verify(tmp_path / "a").torn == (2,)
-    assert [flaw.flaw for flaw in _judge([lines[0], *lines[2:]]).flaws] == [Flaw.EDITED]
+    path = tmp_path / "a"
+    assert verify(path).torn == (2,)
+    flaws = _judge([lines[0], *lines[2:]]).flaws
+    assert [flaw.flaw for flaw in flaws] == [Flaw.EDITED]
 
 
 @pytest.mark.parametrize("strange", [[1], {"a": 1}, None, "1", 1.5])
@@ -500,6 +537,7 @@ def test_an_entry_that_is_taken_in_part_fails_with_the_cause_of_the_rest(
     append(path, AuditAction.WRITE_FOUND, at=NOW, who="me", subject="cell", details={"n": 2})
     entries = read(path)
     assert entries[0] == first
-    assert [one.action for one in entries[1:]] == [AuditAction.TORN_LINE, AuditAction.WRITE_FOUND]
+    actions = [one.action for one in entries[1:]]
+    assert actions == [AuditAction.TORN_LINE, AuditAction.WRITE_FOUND]
     assert verify(path).holds
     assert verify(path).torn == (2,)

@@ -30,7 +30,8 @@ FELL = (1.0, 1.0, 1.0, 0.9, 1.0, 1.0)  #: Gain of J4, 10 % less
 
 def enter_at(ledger: Ledger, calibration: Calibration, at: datetime) -> str:
     """Record, fit and enter a calibration by a clock that says `at`."""
-    made = recorded(replace(calibration, created=at.isoformat()), at)
+    changed_calibration = replace(calibration, created=at.isoformat())
+    made = recorded(changed_calibration, at)
     digest = digest_of(made)
     enter_calibration(ledger, made, digest=digest, who="anna", at=at)
     return digest
@@ -47,7 +48,8 @@ def entries_with(
     for number in range(weeks):
         factors = FELL if number >= fell_from else (1.0,) * 6
         at = week(number) + wrong.get(number, timedelta(0))
-        enter_at(ledger, calibration_of(number, factors), at)
+        calibration = calibration_of(number, factors)
+        enter_at(ledger, calibration, at)
     return list(read_history(ledger).entries)
 
 
@@ -56,14 +58,14 @@ def test_a_calibration_under_a_wrong_date_is_at_its_place_in_the_history(
     tmp_path: Path, days: int
 ) -> None:
     entries = entries_with(ledger_in(tmp_path), {6: timedelta(days=days)})
-    assert [entry.created_by_clock is not None for entry in entries] == [
-        number == 6 for number in range(14)
-    ]
+    expected = [number == 6 for number in range(14)]
+    assert [entry.created_by_clock is not None for entry in entries] == expected
     assert [entry.recorded for entry in entries if entry.created_by_clock is None] == [
         week(n) for n in range(14) if n != 6
     ]
     assert week(5) <= entries[6].recorded <= week(7)
-    assert entries[6].created_by_clock == week(6) + timedelta(days=days)
+    created_by_clock = entries[6].created_by_clock
+    assert created_by_clock == week(6) + timedelta(days=days)
 
 
 @pytest.mark.parametrize("days", [-730, 730])
@@ -81,7 +83,8 @@ def test_a_drift_is_found_behind_a_calibration_of_a_wrong_date(tmp_path: Path, d
 
 def test_the_first_calibration_may_be_the_one_of_the_wrong_date(tmp_path: Path) -> None:
     entries = entries_with(ledger_in(tmp_path), {0: timedelta(days=730)}, weeks=4)
-    assert entries[0].created_by_clock == week(0) + timedelta(days=730)
+    expected = week(0) + timedelta(days=730)
+    assert entries[0].created_by_clock == expected
     assert [entry.recorded for entry in entries[1:]] == [week(1), week(2), week(3)]
     assert entries[0].recorded < week(1)
 
@@ -112,29 +115,31 @@ def test_the_same_logs_fitted_again_under_a_wrong_date_keep_their_place(tmp_path
         ledger, again, digest=digest_of(again), who="anna", at=week(4) + timedelta(days=730)
     )
     enter_at(ledger, calibration_of(5), week(5))
-    (found,) = (entry for entry in read_history(ledger).entries if entry.digest == digest_of(again))
+    entries = read_history(ledger).entries
+    (found,) = (entry for entry in entries if entry.digest == digest_of(again))
     assert found.recorded == week(1)
-    assert found.created_by_clock == week(4) + timedelta(days=730)
+    expected = week(4) + timedelta(days=730)
+    assert found.created_by_clock == expected
 
 
 def test_history_says_which_date_was_wrong(
     checkout: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    configs = Path(
-        shutil.copytree(
-            checkout / "configs", tmp_path / "configs", ignore=shutil.ignore_patterns("*.jsonl*")
-        )
-    )
+    ignore = shutil.ignore_patterns("*.jsonl*")
+    configs = Path(shutil.copytree(checkout / "configs", tmp_path / "configs", ignore=ignore))
     file = configs / "cells/demo.yaml"
     entries_with(ledger_of(file), {2: timedelta(days=730)}, weeks=5)
     assert main(["history", str(file)]) == ExitCode.OK
-    shown = " ".join(capsys.readouterr().out.split())
+    printed = capsys.readouterr().out
+    shown = " ".join(printed.split())
     assert (
         "found the date 2028-01-19; expected one about 2026-01-12, by the order of the audit log"
     ) in shown
     assert main(["history", str(file), "--json"]) == ExitCode.OK
-    (axis, *_) = json.loads(capsys.readouterr().out)["axes"]
-    assert ["misdated" in point for point in axis["points"]] == [False, False, True, False, False]
+    document = json.loads(capsys.readouterr().out)
+    (axis, *_) = document["axes"]
+    expected = [False, False, True, False, False]
+    assert ["misdated" in point for point in axis["points"]] == expected
 
 
 def test_a_write_that_was_found_is_in_force_after_one_of_a_wrong_later_date(tmp_path: Path) -> None:
@@ -188,8 +193,10 @@ def test_the_longest_series_is_one_that_never_decreases_and_none_is_longer(
         before = [
             length for other, length in zip(times[:index], lengths, strict=True) if other <= time
         ]
-        lengths.append(1 + max(before, default=0))
-    assert len(chosen) == max(lengths, default=0)
+        largest_before = max(before, default=0)
+        lengths.append(1 + largest_before)
+    expected = max(lengths, default=0)
+    assert len(chosen) == expected
 
 
 @given(st.lists(st.integers(-20_000, 20_000), min_size=1, max_size=12))

@@ -57,7 +57,9 @@ FLAT = (1.0,) * 6
 
 def drifting(week: int) -> tuple[float, ...]:
     """J4 loses 6 % from the 14th calibration on, in twelve weeks."""
-    return (1.0, 1.0, 1.0, 1.0 - 0.06 * min(max(week - 13, 0) / 12.0, 1.0), 1.0, 1.0)
+    largest_week = max(week - 13, 0)
+    smallest = min(largest_week / 12.0, 1.0)
+    return (1.0, 1.0, 1.0, 1.0 - 0.06 * smallest, 1.0, 1.0)
 
 
 def sloping(week: int) -> tuple[float, ...]:
@@ -74,8 +76,10 @@ def stepping(factors: tuple[float, ...]) -> Callable[[int], tuple[float, ...]]:
 def cell(tmp_path: Path) -> Path:
     """The demo cell in a folder of its own."""
     kept = shutil.ignore_patterns("*.jsonl*", "*.sqlite*")
-    shutil.copytree(Path(__file__).parents[3] / "configs", tmp_path / "configs", ignore=kept)
-    return tmp_path / "configs" / "cells" / "demo.yaml"
+    configs_folder = Path(__file__).parents[3] / "configs"
+    shutil.copytree(configs_folder, tmp_path / "configs", ignore=kept)
+    cells_folder = tmp_path / "configs" / "cells"
+    return cells_folder / "demo.yaml"
 
 
 def _place(cell: Path) -> HistoryPlace:
@@ -111,7 +115,8 @@ def _series(cell: Path) -> tuple[Series, ...]:
 
 def _json(capsys: pytest.CaptureFixture[str], *arguments: str) -> dict[str, Any]:
     assert main(["history", *arguments, "--json"]) == 0
-    found: dict[str, Any] = json.loads(capsys.readouterr().out)
+    printed = capsys.readouterr().out
+    found: dict[str, Any] = json.loads(printed)
     return found
 
 
@@ -126,7 +131,8 @@ def _put(cell: Path, digest: str) -> str:
     """The gains of a calibration into the cell's controller, past drivegain; its file."""
     controller = load_cell(cell).controller_path
     assert controller is not None
-    (entry,) = [one for one in history_of(cell).entries if one.digest == digest]
+    entries = history_of(cell).entries
+    (entry,) = [one for one in entries if one.digest == digest]
     keys = {gain.axis: f"drives.{gain.axis}.gain" for gain in entry.gains}
     document = read_controller(controller.read_bytes(), controller.name)
     scalars = document.locate(tuple(keys.values()))
@@ -141,7 +147,8 @@ def _put(cell: Path, digest: str) -> str:
 def test_an_empty_history_says_what_to_do(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["history", str(cell)]) == 0
     assert "The history is empty" in capsys.readouterr().out
-    assert _json(capsys, str(cell))["axes"] == []
+    axes = _json(capsys, str(cell))["axes"]
+    assert axes == []
     assert main(["history", str(cell), "--verify"]) == 0
     assert "0 entries, chain unbroken" in capsys.readouterr().out
     assert not _place(cell).audit.exists()
@@ -159,12 +166,14 @@ def test_a_calibration_is_entered_by_hand(cell: Path, capsys: pytest.CaptureFixt
     assert "baseline: 1 of 12" in shown.out
     assert main(["history", str(cell), "--add", str(file)]) == 0
     assert "already" in capsys.readouterr().err
-    save_calibration(replace(calibration_of(1), cell="another"), file)
+    calibration = replace(calibration_of(1), cell="another")
+    save_calibration(calibration, file)
     assert main(["history", str(cell), "--add", str(file)]) == 4
     assert "another" in capsys.readouterr().err
     assert main(["history", str(cell), "--add", str(cell)]) == 4
     assert main(["history", str(cell), "--add", str(file) + ".none"]) == 4
-    assert len(_series(cell)[0].points) == 1
+    points = _series(cell)[0].points
+    assert len(points) == 1
 
 
 def test_a_drift_is_reported_with_its_time_its_size_and_a_question(
@@ -174,7 +183,8 @@ def test_a_drift_is_reported_with_its_time_its_size_and_a_question(
     write(ledger_of(cell), "x.yaml", "1", digest=digests[8], at=BEGIN + timedelta(weeks=8))
     _put(cell, digests[8])
     assert main(["history", str(cell)]) == 0
-    out = " ".join(capsys.readouterr().out.split())
+    printed = capsys.readouterr().out
+    out = " ".join(printed.split())
     assert re.search(r"ALARM: gain of J4 fell 5\.\d % since 2026-04-\d\d, \d\d\.\d σ", out)
     assert out.count("ALARM:") == 1
     assert "demagnetised" in out
@@ -197,7 +207,8 @@ def test_a_drift_from_the_first_day_is_reported_as_steady(
 ) -> None:
     _filled(cell, 9, sloping)
     assert main(["history", str(cell), "--axis", "J4"]) == 0
-    out = " ".join(capsys.readouterr().out.split())
+    printed = capsys.readouterr().out
+    out = " ".join(printed.split())
     reported = re.search(
         r"ALARM: gain of J4 falls steadily since 2026-01-05, (\d\.\d) % until "
         r"now, (\d\.\d) σ",
@@ -207,10 +218,13 @@ def test_a_drift_from_the_first_day_is_reported_as_steady(
     assert float(reported[1]) == pytest.approx(1.6, abs=1.0)  # 8 × 0.2 %, and its σ is 0.5 %
     assert "demagnetised" in out
     found = _json(capsys, str(cell), "--axis", "J4")
-    point = found["axes"][0]["points"][-1]
+    points = found["axes"][0]["points"]
+    point = points[-1]
     assert point["alarm"] == "trend"
-    assert abs(point["trend_sigmas"]) == pytest.approx(float(reported[2]), abs=0.05)
-    assert point["trend_sigmas"] < -found["chart"]["trend"]
+    absolute_trend_sigma = abs(point["trend_sigmas"])
+    assert absolute_trend_sigma == pytest.approx(float(reported[2]), abs=0.05)
+    trend = found["chart"]["trend"]
+    assert point["trend_sigmas"] < -trend
     picture = cell.parent / "history.svg"
     assert main(["history", str(cell), "--plot", str(picture)]) == 0
     assert b"steady change" in picture.read_bytes()
@@ -230,7 +244,9 @@ def test_an_alarm_that_has_passed_has_no_date(
     assert (axis["alarmed"], axis["alarm"], axis["since"]) == (False, None, None)
     known = [point.gain.value for point in series.points[:12]]
     stds = [point.gain.std for point in series.points[:12]]
-    assert axis["baseline"] == pytest.approx(np.average(known, weights=np.array(stds) ** -2.0))
+    weights = np.array(stds) ** -2.0
+    mean_known = np.average(known, weights=weights)
+    assert axis["baseline"] == pytest.approx(mean_known)
 
 
 def test_without_a_drift_there_is_no_alarm(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -257,15 +273,18 @@ def test_each_pattern_has_its_question(cell: Path, factors: tuple[float, ...], s
 
 
 def test_a_configuration_that_changed_is_asked_for(cell: Path) -> None:
-    _filled(cell, 20, stepping((0.96,) * 6))
+    factors = (0.96,) * 6
+    _filled(cell, 20, stepping(factors))
     enter(ledger_of(cell), replace(calibration_of(20, (0.96,) * 6), configuration_sha256="d" * 64))
     assert "configuration changed" in questions(_series(cell))[1]
 
 
 def test_a_gain_below_zero_falls_towards_zero(cell: Path) -> None:
-    _filled(cell, 20, stepping((1.0, 1.0, 1.0, 0.9, 1.0, 1.0)))
+    factors = (1.0, 1.0, 1.0, 0.9, 1.0, 1.0)
+    _filled(cell, 20, stepping(factors))
     series = _series(cell)[3]
-    assert series.points[-1].gain.value < 0
+    last_point = series.points[-1]
+    assert last_point.gain.value < 0
     words = alarm_text(series)
     assert words is not None
     assert words.startswith("gain of J4 fell 9.6 %")
@@ -286,44 +305,57 @@ def test_the_same_logs_fitted_again_are_no_other_day(cell: Path) -> None:
     ledger = ledger_of(cell)
 
     def points() -> tuple[Point, ...]:
-        return watch(read_history(ledger).entries, ())[3].points
+        entries = read_history(ledger).entries
+        return watch(entries, ())[3].points
 
     digests = [enter(ledger, fit) for fit in fits]
     assert len(read_history(ledger).entries) == 12
     (point,) = points()
-    assert point.entry.digest == digests[-1]
+    expected = digests[-1]
+    assert point.entry.digest == expected
     assert point.entry.recorded == BEGIN
     write(ledger, "x.yaml", "1", digest=digests[4])
     enter(ledger, calibration_of(1))
     assert [point.entry.digest for point in points()] == [digests[4], digest_of(calibration_of(1))]
-    held = tuple(replace(gain, std=0.0) for gain in fits[0].gains)
+    gains = fits[0].gains
+    held = tuple(replace(gain, std=0.0) for gain in gains)
     # Knows no gain, hides none
-    enter(ledger, replace(fits[0], gains=held, sources=calibration_of(1).sources))
-    assert points()[1].entry.digest == digest_of(calibration_of(1))
+    sources = calibration_of(1).sources
+    changed_fit = replace(fits[0], gains=held, sources=sources)
+    enter(ledger, changed_fit)
+    digest = points()[1].entry.digest
+    assert digest == digest_of(calibration_of(1))
     # Another log held out is another question to the same recordings.
-    other = replace(fits[0], sources=(*logs[:2], replace(logs[2], sha256="9" * 64)))
+    sha256 = "9" * 64
+    changed_log = replace(logs[2], sha256=sha256)
+    other = replace(fits[0], sources=(*logs[:2], changed_log))
     assert logs_of(other, "") == logs_of(fits[0], "")
-    assert logs_of(replace(fits[0], sources=()), "its own") == "its own"
+    calibration = replace(fits[0], sources=())
+    assert logs_of(calibration, "its own") == "its own"
 
 
 def test_old_logs_fitted_today_report_their_own_time(cell: Path) -> None:
     """A gain that was another one a year ago has not changed today."""
     _filled(cell, 20, lambda _: FLAT)
-    year_ago = recorded(calibration_of(30, (0.9,) * 6), BEGIN - timedelta(days=400))
+    factors = (0.9,) * 6
+    calibration = calibration_of(30, factors)
+    begin_difference = BEGIN - timedelta(days=400)
+    year_ago = recorded(calibration, begin_difference)
     enter(ledger_of(cell), year_ago)
-    assert history_of(cell).entries[-1].digest == digest_of(year_ago)  # fitted last
+    last_entry = history_of(cell).entries[-1]
+    assert last_entry.digest == digest_of(year_ago)  # fitted last
     series = _series(cell)[3]
-    assert series.points[0].entry.digest == digest_of(year_ago)
-    assert [point.entry.recorded for point in series.points[:2]] == [
-        BEGIN - timedelta(days=400),
-        BEGIN,
-    ]
+    digest = series.points[0].entry.digest
+    assert digest == digest_of(year_ago)
+    expected = [BEGIN - timedelta(days=400), BEGIN]
+    assert [point.entry.recorded for point in series.points[:2]] == expected
     assert series.onset is None or series.onset < BEGIN + timedelta(weeks=1)
 
 
 @pytest.mark.parametrize("recorded_s", [None, float("nan"), 1e300])
 def test_a_log_without_its_time_has_that_of_the_fit(recorded_s: float | None) -> None:
-    assert recorded_at(with_recordings(calibration_of(3), recorded_s=recorded_s), BEGIN) == BEGIN
+    calibration = with_recordings(calibration_of(3), recorded_s=recorded_s)
+    assert recorded_at(calibration, BEGIN) == BEGIN
 
 
 def test_a_gain_that_was_held_fixed_knows_nothing(
@@ -334,7 +366,9 @@ def test_a_gain_that_was_held_fixed_knows_nothing(
     enter(
         ledger_of(cell), replace(fixed, gains=(replace(fixed.gains[0], std=0.0), *fixed.gains[1:]))
     )
-    assert [len(series.points) for series in _series(cell)] == [3, 4, 4, 4, 4, 4]
+    point_counts = [len(series.points) for series in _series(cell)]
+    expected = [3, 4, 4, 4, 4, 4]
+    assert point_counts == expected
     assert main(["history", str(cell)]) == 0
     assert "J1" in capsys.readouterr().out
 
@@ -353,9 +387,8 @@ def _job_s_dispersions(cell: Path, own: Calibration | None = None) -> dict[str, 
     changes = [
         GainChange(name, name, 1, 1.0, 1.0, 0.1, "Nm/A", 1.0, "") for name in declared.axis_names
     ]
-    return dict(
-        known_of(history_of(cell), str(resolve_links(controller)), digest, changes).dispersions
-    )
+    known = known_of(history_of(cell), str(resolve_links(controller)), digest, changes)
+    return dict(known.dispersions)
 
 
 def test_a_job_and_the_charts_know_one_scatter(cell: Path) -> None:
@@ -366,11 +399,15 @@ def test_a_job_and_the_charts_know_one_scatter(cell: Path) -> None:
     before = {series.axis: series.dispersion for series in _series(cell)}
     assert min(before.values()) > 1.5
     assert _job_s_dispersions(cell) == before
-    fitted = calibration_of(5, (1.0 - 0.012,) * 6)
-    again = replace(fitted, gains=(replace(fitted.gains[0], std=0.0), *fitted.gains[1:]))
+    factors = (1.0 - 0.012,) * 6
+    fitted = calibration_of(5, factors)
+    changed_gain = replace(fitted.gains[0], std=0.0)
+    gains = (changed_gain, *fitted.gains[1:])
+    again = replace(fitted, gains=gains)
     enter(ledger_of(cell), again)
     charts = _series(cell)
-    assert [len(series.points) for series in charts] == [12] * 6
+    point_counts = [len(series.points) for series in charts]
+    assert point_counts == [12] * 6
     refitted = {series.axis: series.dispersion for series in charts}
     assert _job_s_dispersions(cell) == refitted
     assert refitted == pytest.approx(before, rel=0.05)  # the same recordings of all axes as before
@@ -379,11 +416,13 @@ def test_a_job_and_the_charts_know_one_scatter(cell: Path) -> None:
         ledger_of(cell), replace(alone, gains=(replace(alone.gains[0], std=0.0), *alone.gains[1:]))
     )
     charts = _series(cell)
-    assert [len(series.points) for series in charts] == [12, 13, 13, 13, 13, 13]
+    expected = [12, 13, 13, 13, 13, 13]
+    assert [len(series.points) for series in charts] == expected
     found = {series.axis: series.dispersion for series in charts}
     assert _job_s_dispersions(cell) == found
     # What a session has found itself is not what it is judged by.
-    assert _job_s_dispersions(cell, calibration_of(13, (1.2,) * 6)) == found
+    own = calibration_of(13, (1.2,) * 6)
+    assert _job_s_dispersions(cell, own) == found
     assert {series.axis: series.dispersion for series in _series(cell)} != found
 
 
@@ -406,11 +445,11 @@ def test_the_scatter_of_axes_is_reported_together_where_the_same_recordings_know
     ]
     found = dispersions_of(entries, names)
     assert tuple(found) == names
-    np.testing.assert_allclose(
-        [found["J1"], found["J2"]], dispersions(values[:, :2].T, np.full((2, 9), 0.1))
-    )
+    expected = dispersions(values[:, :2].T, np.full((2, 9), 0.1))
+    np.testing.assert_allclose([found["J1"], found["J2"]], expected)
     alone = np.delete(values[:, 2], 4)
-    np.testing.assert_allclose(found["J3"], dispersions([alone], np.full((1, 8), 0.1))[0])
+    stds = np.full((1, 8), 0.1)
+    np.testing.assert_allclose(found["J3"], dispersions([alone], stds)[0])
     assert dispersions_of(entries[:4], names) == dict.fromkeys(names, DISPERSION)
     assert dispersions_of((), names) == dict.fromkeys(names, DISPERSION)
     assert dispersions_of(entries, ("J9",)) == {"J9": DISPERSION}
@@ -425,7 +464,8 @@ def test_an_axis_has_a_table_of_its_own(cell: Path, capsys: pytest.CaptureFixtur
     assert "CUSUM" in out
     assert "No alarm" in out
     assert main(["history", str(cell), "--axis", "J9"]) == 2
-    assert "one of J1" in " ".join(capsys.readouterr().err.split())
+    error_output = capsys.readouterr().err
+    assert "one of J1" in " ".join(error_output.split())
 
 
 def test_a_change_that_is_explained_begins_a_new_baseline(
@@ -450,7 +490,8 @@ def test_a_change_that_is_explained_begins_a_new_baseline(
     assert [stretch.began for stretch in series.stretches] == [0, 25]
     assert series.alarm_at(24) is not None  # a shown alarm stays
     assert not any(other.acknowledged for other in _series(cell) if other.axis != "J4")
-    entry = read(_place(cell).audit)[-1]
+    path = _place(cell).audit
+    entry = read(path)[-1]
     assert entry.action is AuditAction.ACKNOWLEDGED
     assert entry.who.startswith("anna")
     assert entry.details["why"] == "gearbox changed"
@@ -464,7 +505,8 @@ def test_a_change_that_is_explained_begins_a_new_baseline(
 
 
 def test_a_new_baseline_begins_where_one_says(cell: Path) -> None:
-    _filled(cell, 20, stepping((1.0, 1.0, 1.0, 0.9, 1.0, 1.0)))
+    factors = (1.0, 1.0, 1.0, 0.9, 1.0, 1.0)
+    _filled(cell, 20, stepping(factors))
     explain = ["history", str(cell), "--acknowledge", "J4", "--why", "motor exchanged", "--since"]
     assert main([*explain, "someday"]) == 2
     assert main([*explain, (BEGIN + timedelta(weeks=15)).date().isoformat()]) == 0
@@ -496,10 +538,12 @@ def test_a_baseline_that_begins_later_than_now_is_refused(
     _filled(cell, 3, lambda _: FLAT)
     explain = ["history", str(cell), "--acknowledge", "J4", "--why", "planned", "--since"]
     assert main([*explain, "2130-01-02T03:04:05+01:00"]) == 2
-    output = " ".join(capsys.readouterr().err.split())
+    error_output = capsys.readouterr().err
+    output = " ".join(error_output.split())
     assert "2130-01-02 02:04:05 UTC" in output
     assert f"no later than now, {datetime.now(UTC):%Y-%m-%d}" in output
-    assert len(read(_place(cell).audit)) == 3
+    path = _place(cell).audit
+    assert len(read(path)) == 3
     assert main([*explain, datetime.now(UTC).date().isoformat()]) == 0
 
 
@@ -507,7 +551,8 @@ def test_a_log_of_tomorrow_begins_its_baseline_now(
     cell: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The clock of its recorder was ahead."""
-    weeks = (datetime.now(UTC) - BEGIN).days // 7 + 2
+    days = (datetime.now(UTC) - BEGIN).days
+    weeks = days // 7 + 2
     enter(ledger_of(cell), calibration_of(weeks))
     assert main(["history", str(cell), "--acknowledge", "J4", "--why", "motor exchanged"]) == 0
     assert _series(cell)[3].began == 0
@@ -529,7 +574,8 @@ def test_a_log_of_tomorrow_begins_its_baseline_now(
 def test_an_explanation_without_its_parts_is_refused(cell: Path, arguments: list[str]) -> None:
     _filled(cell, 3, lambda _: FLAT)
     assert main(["history", str(cell), *arguments]) == 2
-    assert len(read(_place(cell).audit)) == 3
+    path = _place(cell).audit
+    assert len(read(path)) == 3
 
 
 def test_the_table_leaves_as_csv(cell: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -542,8 +588,10 @@ def test_the_table_leaves_as_csv(cell: Path, capsys: pytest.CaptureFixture[str])
     assert tuple(rows[0]) == COLUMNS
     assert [row["axis"] for row in rows[::15]] == list(AXES)
     found = {series.axis: series for series in _series(cell)}
-    for row, point in zip(rows[45:60], found["J4"].points, strict=True):
-        assert float(row["gain"]) == point.gain.value
+    points = found["J4"].points
+    for row, point in zip(rows[45:60], points, strict=True):
+        gain = float(row["gain"])
+        assert gain == point.gain.value
         assert datetime.fromisoformat(row["created"]) == point.entry.created
         assert row["unit"] == "Nm/A"
     assert rows[0]["change_percent"] == ""
@@ -570,12 +618,14 @@ def test_the_picture_is_drawn_the_same_each_time(
 
 def test_a_picture_has_its_kind_and_replaces_only_its_like(cell: Path) -> None:
     _filled(cell, 1, lambda _: FLAT)
-    assert main(["history", str(cell), "--plot", str(cell.parent / "history.pdf")]) == 2
+    history_path = cell.parent / "history.pdf"
+    assert main(["history", str(cell), "--plot", str(history_path)]) == 2
     notes = cell.parent / "notes.png"
     notes.write_text("my notes")
     assert main(["history", str(cell), "--plot", str(notes)]) == 2
     assert notes.read_text() == "my notes"
-    assert main(["history", str(cell), "--plot", str(cell.parent / "none" / "history.png")]) == 1
+    none_folder = cell.parent / "none"
+    assert main(["history", str(cell), "--plot", str(none_folder / "history.png")]) == 1
 
 
 def test_a_broken_audit_is_reported_by_its_first_line(
@@ -589,14 +639,16 @@ def test_a_broken_audit_is_reported_by_its_first_line(
     verify = ["history", str(cell), "--verify"]
     assert main(verify) == 0
     assert "4 entries, chain unbroken" in capsys.readouterr().out
-    audit.write_bytes(audit.read_bytes().replace(b'"k":2', b'"k":7'))
+    changed_content = audit.read_bytes().replace(b'"k":2', b'"k":7')
+    audit.write_bytes(changed_content)
     assert main(verify) == 4
     shown = capsys.readouterr()
     assert "line 3" in shown.err
     assert "BROKEN" in shown.out
     assert "keep this file" in shown.err
     assert main([*verify, "--json"]) == 4
-    assert json.loads(capsys.readouterr().out)["audit"]["broken_line"] == 3
+    document = json.loads(capsys.readouterr().out)
+    assert document["audit"]["broken_line"] == 3
 
 
 def test_an_audit_whose_end_was_cut_off_is_noticed(
@@ -609,9 +661,12 @@ def test_an_audit_whose_end_was_cut_off_is_noticed(
         for _ in range(3)
     ]
     assert main(["history", str(cell), "--verify"]) == 0
-    place.audit.write_bytes(b"".join(place.audit.read_bytes().splitlines(keepends=True)[:2]))
+    lines = place.audit.read_bytes().splitlines(keepends=True)
+    place.audit.write_bytes(b"".join(lines[:2]))
     assert main(["history", str(cell), "--verify"]) == 4
-    assert entries[2].sha256[:12] in capsys.readouterr().err
+    sha256 = entries[2].sha256
+    error_output = capsys.readouterr().err
+    assert sha256[:12] in error_output
 
 
 def test_an_audit_without_the_end_of_a_session_is_noticed(
@@ -621,21 +676,25 @@ def test_an_audit_without_the_end_of_a_session_is_noticed(
     cell.write_text(cell.read_text() + RECALIBRATION)
     declared = load_cell(cell)
     assert declared.recalibration is not None
+    path = _place(cell).audit
     ended = append(
-        _place(cell).audit,
+        path,
         AuditAction.RECALIBRATION_ENDED,
         at=BEGIN,
         who="job",
         subject="x",
         details={},
     )
-    session = begin(declared.recalibration.folder, Basis(declared.name, declared.digest, ""), BEGIN)
+    basis = Basis(declared.name, declared.digest, "")
+    session = begin(declared.recalibration.folder, basis, BEGIN)
     assert main(["history", str(cell), "--verify"]) == 0
-    save_session(replace(session, state=session.state.with_(audit_sha256=ended.sha256)))
+    state = session.state.with_(audit_sha256=ended.sha256)
+    save_session(replace(session, state=state))
     assert main(["history", str(cell), "--verify"]) == 0
     _place(cell).audit.unlink()
     assert main(["history", str(cell), "--verify"]) == 4
-    assert ended.sha256[:12] in capsys.readouterr().err
+    error_output = capsys.readouterr().err
+    assert ended.sha256[:12] in error_output
 
 
 @pytest.mark.parametrize(
@@ -646,12 +705,14 @@ def test_a_write_that_never_ended_is_reported_with_what_the_file_is(
 ) -> None:
     file = cell.parent / "controller.yaml"
     file.write_bytes(content)
+    digest = hashlib.sha256(b"old").hexdigest()
     digests = {
-        "sha256_before": hashlib.sha256(b"old").hexdigest(),
+        "sha256_before": digest,
         "sha256_after": hashlib.sha256(b"new").hexdigest(),
     }
+    path = _place(cell).audit
     append(
-        _place(cell).audit,
+        path,
         AuditAction.APPLY_BEGUN,
         at=BEGIN,
         who="anna",
@@ -659,7 +720,8 @@ def test_a_write_that_never_ended_is_reported_with_what_the_file_is(
         details=digests,
     )
     assert main(["history", str(cell), "--verify"]) == 0
-    assert says in " ".join(capsys.readouterr().out.split())
+    printed = capsys.readouterr().out
+    assert says in " ".join(printed.split())
 
 
 def _write_down(cell: Path, digest: str, *, back: bool = False, at: datetime = BEGIN) -> AuditEntry:
@@ -674,7 +736,8 @@ def _verified(cell: Path, capsys: pytest.CaptureFixture[str]) -> str:
     """Return the findings of --verify in one line; empty where all is well."""
     capsys.readouterr()
     code = main(["history", str(cell), "--verify"])
-    output = " ".join(capsys.readouterr().err.split())
+    error_output = capsys.readouterr().err
+    output = " ".join(error_output.split())
     assert code == (4 if output else 0)
     return output
 
@@ -689,8 +752,9 @@ def test_a_write_of_which_the_history_does_not_know_is_reported_and_entered_by_h
     first = _write_down(cell, digest)
     back = _write_down(cell, digest, back=True)
     # Of another target the history of this cell need not know.
+    path = _place(cell).audit
     append(
-        _place(cell).audit,
+        path,
         AuditAction.APPLIED,
         at=BEGIN,
         who="anna",
@@ -701,18 +765,23 @@ def test_a_write_of_which_the_history_does_not_know_is_reported_and_entered_by_h
     for part in (f"entry {first.number} of", "applied by anna", digest[:12], "--add"):
         assert part in reported
     assert main(["history", str(cell), "--verify", "--json"]) == 4
-    found = json.loads(capsys.readouterr().out)["audit"]
+    printed = capsys.readouterr().out
+    found = json.loads(printed)["audit"]
     assert [(one["number"], one["calibration_sha256"]) for one in found["unknown_writes"]] == [
         (2, digest)
     ]
     assert main(["history", str(cell), "--add", str(file)]) == 0
-    assert capsys.readouterr().err.count("Entered too") == 1
+    error_output = capsys.readouterr().err
+    assert error_output.count("Entered too") == 1
     assert _verified(cell, capsys) == ""
     history = history_of(cell)
-    assert [(event.action, event.at, event.who, event.audit) for event in history.events] == [
+    expected = [
         (WriteAction.APPLIED, BEGIN, "anna", first.sha256),
         (WriteAction.ROLLED_BACK, BEGIN, "anna", back.sha256),
     ]
+    assert [
+        (event.action, event.at, event.who, event.audit) for event in history.events
+    ] == expected
     assert history.in_force() is None
     assert main(["history", str(cell), "--add", str(file)]) == 0
     assert "Entered too" not in capsys.readouterr().err
@@ -732,9 +801,12 @@ def test_a_write_whose_calibration_is_added_later_is_in_its_place(
     assert f"entry {lost.number} of" in reported
     assert f"entry {known.number} of" not in reported
     assert main(["history", str(cell), "--add", str(file)]) == 0
-    assert capsys.readouterr().err.count("Entered too") == 1
+    error_output = capsys.readouterr().err
+    assert error_output.count("Entered too") == 1
     assert _verified(cell, capsys) == ""
-    assert [event.digest for event in history_of(cell).events] == [first, second]
+    events = history_of(cell).events
+    digests = [event.digest for event in events]
+    assert digests == [first, second]
 
 
 def test_nothing_is_entered_from_an_audit_that_someone_changed(
@@ -745,7 +817,8 @@ def test_nothing_is_entered_from_an_audit_that_someone_changed(
     save_calibration(calibration, file)
     _write_down(cell, digest_of(calibration))
     audit = _place(cell).audit
-    audit.write_bytes(audit.read_bytes().replace(b'"who":"anna"', b'"who":"kim"'))
+    changed_content = audit.read_bytes().replace(b'"who":"anna"', b'"who":"kim"')
+    audit.write_bytes(changed_content)
     changed = audit.read_bytes()
     assert main(["history", str(cell), "--add", str(file)]) == 3
     assert "Entered too" not in capsys.readouterr().err
@@ -765,7 +838,8 @@ def test_drives_that_are_written_once_more_are_written_twice(
         write(ledger_of(cell), subject, "1" * 64, digest=digest, before=before)
     assert _verified(cell, capsys) == ""
     history = history_of(cell)
-    assert [(event.target, event.digest) for event in history.events] == [(subject, digest)] * 2
+    expected = [(subject, digest)] * 2
+    assert [(event.target, event.digest) for event in history.events] == expected
     assert history.in_force(subject) == digest
 
 
@@ -779,7 +853,8 @@ def test_in_force_is_what_the_cell_s_own_controller_has(
         write(ledger_of(cell), target, digest[::-1], digest=digest)
 
     def found_in_force() -> str | None:
-        return str(found) if (found := _json(capsys, str(cell))["in_force"]) else None
+        in_force = _json(capsys, str(cell))["in_force"]
+        return str(found) if (found := in_force) else None
 
     applied(first, own)
     applied(second, "/another/controller.yaml")
@@ -789,12 +864,14 @@ def test_in_force_is_what_the_cell_s_own_controller_has(
     assert found_in_force() == first
     _put(cell, third)
     assert found_in_force() == third
-    edited = Path(own).read_text().replace("loop:", "lopp:")
+    text = Path(own).read_text()
+    edited = text.replace("loop:", "lopp:")
     Path(own).write_text(edited + "# K.\n")
     assert found_in_force() == third  # the gains are the same
     capsys.readouterr()
     assert main(["history", str(cell)]) == 0
-    assert " ".join(capsys.readouterr().out.split()).count("in force") == 1
+    printed = capsys.readouterr().out
+    assert " ".join(printed.split()).count("in force") == 1
     _put(cell, third)
     Path(own).write_text(re.sub("gain: -9[.0-9]*", "gain: -9.5", Path(own).read_text()))
     assert found_in_force() is None
@@ -834,7 +911,8 @@ def test_what_was_done_is_reported_in_the_words_of_who_did_it() -> None:
 
 def test_no_one_waits_for_a_pipe_or_reads_a_device_to_its_end(cell: Path) -> None:
     os.mkfifo(cell.parent / "pipe")
-    for path in (cell.parent / "pipe", Path("/dev/zero"), cell.parent):
+    pipe_folder = cell.parent / "pipe"
+    for path in (pipe_folder, Path("/dev/zero"), cell.parent):
         assert main(["history", str(cell), "--add", str(path)]) == 4
 
 
@@ -856,16 +934,16 @@ def test_a_lost_history_is_not_called_empty(
     assert "--verify" in caplog.text
     assert "no calibration" not in capsys.readouterr().out
     # The next entry does not hide that there were others.
-    entered = append(
-        _place(cell).audit, AuditAction.PROPOSED, at=BEGIN, who="anna", subject="x", details={}
-    )
+    path = _place(cell).audit
+    entered = append(path, AuditAction.PROPOSED, at=BEGIN, who="anna", subject="x", details={})
     reported = _verified(cell, capsys)
     assert "noted elsewhere and missing here" in reported
     assert entered.sha256[:12] not in reported
     _place(cell).audit.write_bytes(kept)
     caplog.clear()
     assert main(["history", str(cell)]) == 0
-    assert [event.who for event in history_of(cell).events] == ["anna"]
+    events = history_of(cell).events
+    assert [event.who for event in events] == ["anna"]
 
 
 def test_nothing_is_cut_off_in_80_columns(
@@ -883,7 +961,8 @@ def test_an_audit_that_is_no_regular_file_is_broken(
     cell: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     audit = _place(cell).audit
-    for target in (cell.parent, Path("/dev/null"), cell.parent / "pipe"):
+    pipe_folder = cell.parent / "pipe"
+    for target in (cell.parent, Path("/dev/null"), pipe_folder):
         if not target.exists():
             os.mkfifo(target)
         audit.symlink_to(target)

@@ -23,8 +23,10 @@ from tests.daq.histories import history_of
 def cell(tmp_path: Path) -> Path:
     """The demo cell in a folder of its own."""
     kept = shutil.ignore_patterns("*.jsonl*", "*.sqlite*")
-    shutil.copytree(Path(__file__).parents[3] / "configs", tmp_path / "configs", ignore=kept)
-    return tmp_path / "configs" / "cells" / "demo.yaml"
+    configs_folder = Path(__file__).parents[3] / "configs"
+    shutil.copytree(configs_folder, tmp_path / "configs", ignore=kept)
+    cells_folder = tmp_path / "configs" / "cells"
+    return cells_folder / "demo.yaml"
 
 
 @pytest.fixture
@@ -49,10 +51,8 @@ def test_an_audit_of_any_length_is_not_read_into_memory(
         stream.truncate(1 << 40)  # no block of it is on the disk
     assert main(["history", str(cell), "--verify"]) == ExitCode.DATA_UNFIT
     assert "more than 1073741824 bytes" in capsys.readouterr().err
-    assert (
-        main(["apply", str(cell), str(calibration_for(cell, 1.01)), "--yes"])
-        == ExitCode.CALIBRATION_REFUSED
-    )
+    calibration_text = str(calibration_for(cell, 1.01))
+    assert main(["apply", str(cell), calibration_text, "--yes"]) == ExitCode.CALIBRATION_REFUSED
     assert "more than 1073741824 bytes" in capsys.readouterr().err
 
 
@@ -72,7 +72,8 @@ def test_a_write_that_was_killed_before_its_end_is_a_finding_until_it_is_entered
 ) -> None:
     kill_before_the_end(cell)
     assert main(["history", str(cell), "--verify"]) == ExitCode.DATA_UNFIT
-    said = " ".join(capsys.readouterr().err.split())
+    error_output = capsys.readouterr().err
+    said = " ".join(error_output.split())
     assert "no event of entry 1 of the audit, apply begun" in said
     assert "history CELL --add CALIBRATION" in said
     if repair == "apply":
@@ -82,14 +83,13 @@ def test_a_write_that_was_killed_before_its_end_is_a_finding_until_it_is_entered
     if repair == "rollback":
         assert main(["rollback", str(cell)]) == ExitCode.OK
     assert main(["history", str(cell), "--verify"]) == ExitCode.OK
-    found = [event.action for event in history_of(cell).events]
-    assert found == [
-        WriteAction.APPLIED,
-        *([WriteAction.ROLLED_BACK] if repair == "rollback" else []),
-    ]
-    assert [entry.action for entry in read(place_of(cell).audit)].count(
-        AuditAction.WRITE_FOUND
-    ) == 1
+    events = history_of(cell).events
+    found = [event.action for event in events]
+    expected = [WriteAction.APPLIED, *([WriteAction.ROLLED_BACK] if repair == "rollback" else [])]
+    assert found == expected
+    path = place_of(cell).audit
+    actions = [entry.action for entry in read(path)]
+    assert actions.count(AuditAction.WRITE_FOUND) == 1
 
 
 def test_a_write_that_was_killed_is_entered_before_the_one_that_follows(
@@ -102,4 +102,5 @@ def test_a_write_that_was_killed_is_entered_before_the_one_that_follows(
     assert main(["history", str(cell), "--verify"]) == ExitCode.OK
     history = history_of(cell)
     first, second = history.entries
-    assert [event.digest for event in history.events] == [first.digest, second.digest]
+    digests = [event.digest for event in history.events]
+    assert digests == [first.digest, second.digest]

@@ -55,8 +55,10 @@ NO_ONE = 65534
 def cell(tmp_path: Path) -> Path:
     """The demo cell in a folder of its own."""
     kept = shutil.ignore_patterns("*.jsonl*", "*.sqlite*")
-    shutil.copytree(Path(__file__).parents[3] / "configs", tmp_path / "configs", ignore=kept)
-    return tmp_path / "configs" / "cells" / "demo.yaml"
+    configs_folder = Path(__file__).parents[3] / "configs"
+    shutil.copytree(configs_folder, tmp_path / "configs", ignore=kept)
+    cells_folder = tmp_path / "configs" / "cells"
+    return cells_folder / "demo.yaml"
 
 
 @pytest.fixture
@@ -82,7 +84,8 @@ def test_a_calibration_comes_back_as_it_was(ledger: Ledger) -> None:
     assert document == encode_calibration(given_)
     assert decode_calibration(document, "document") == given_
     assert entry.gains == given_.gains
-    assert (entry.digest, entry.cell, entry.method, entry.rows) == (digest, "demo", "ml", 14400)
+    expected = (digest, "demo", "ml", 14400)
+    assert (entry.digest, entry.cell, entry.method, entry.rows) == expected
     assert (entry.error_percent, entry.holdout_percent) == (3.2, 3.3)
     assert entry.created == datetime(2025, 1, 2, 3, 4, 5, tzinfo=UTC)
     assert entry.entered == BEGIN
@@ -114,25 +117,30 @@ def test_entries_are_in_the_order_in_which_they_were_fitted(ledger: Ledger) -> N
         created=(BEGIN + timedelta(hours=1)).astimezone(timezone(-timedelta(hours=9))).isoformat(),
     )
     enter_later(late, 4)
-    found = [entry.created for entry in read_history(ledger).entries]
-    assert found == [
+    entries = read_history(ledger).entries
+    found = [entry.created for entry in entries]
+    expected = [
         BEGIN,
         BEGIN + timedelta(hours=1),
         *(BEGIN + timedelta(weeks=week) for week in (1, 2, 3)),
     ]
+    assert found == expected
 
 
 def test_a_calibration_without_a_time_has_that_of_its_entry(ledger: Ledger) -> None:
     timeless = replace(calibration_of(0), created="yesterday")
-    enter_calibration(ledger, timeless, digest="1" * 64, who="anna", at=BEGIN)
-    assert read_history(ledger).entries[0].created == BEGIN
+    digest = "1" * 64
+    enter_calibration(ledger, timeless, digest=digest, who="anna", at=BEGIN)
+    first_entry = read_history(ledger).entries[0]
+    assert first_entry.created == BEGIN
 
 
 @pytest.mark.parametrize("different", ["cell", "axes", "unit"])
 def test_what_cannot_be_compared_is_refused(ledger: Ledger, different: str) -> None:
     known = calibration_of(0)
+    changed_calibration = replace(calibration_of(1), cell="another")
     other = {
-        "cell": replace(calibration_of(1), cell="another"),
+        "cell": changed_calibration,
         "axes": replace(calibration_of(1), gains=known.gains[:5]),
         "unit": replace(
             calibration_of(1), gains=(*known.gains[:5], replace(known.gains[5], unit="Nm/A_peak"))
@@ -167,11 +175,14 @@ def test_what_is_applied_and_rolled_back_is_reported(ledger: Ledger) -> None:
     write(ledger, "another.yaml", "1", digest=second)
     write(ledger, "x.yaml", "1")
     in_force()
-    assert reported == ["first", "-", "first", "second", "first"]
+    expected = ["first", "-", "first", "second", "first"]
+    assert reported == expected
     history = read_history(ledger)
     assert history.in_force("another.yaml") == second
     assert history.in_force() == first
-    assert [event.action for event in history.entries[0].events] == [
+    events = history.entries[0].events
+    actions = [event.action for event in events]
+    assert actions == [
         WriteAction.APPLIED,
         WriteAction.ROLLED_BACK,
         WriteAction.ROLLED_BACK,
@@ -260,7 +271,8 @@ def test_a_writer_killed_at_any_moment_leaves_a_whole_history(tmp_path: Path) ->
         assert verify(ledger.audit).holds
         history = read_history(ledger)
         assert len(history.entries) == week + 1
-        assert all([gain.axis for gain in entry.gains] == list(AXES) for entry in history.entries)
+        for entry in history.entries:
+            assert [gain.axis for gain in entry.gains] == list(AXES)
         # One may have been ended whose writer did not live to say so.
         assert known <= written.value <= len(history.events) <= written.value + 1
         written.value = known = len(history.events)
@@ -303,7 +315,8 @@ def test_where_nothing_can_be_written_reading_works(ledger: Ledger) -> None:
     ledger.audit.chmod(0o444)
     ledger.audit.parent.chmod(0o555)
     for folder in ledger.audit.parents[1:4]:
-        folder.chmod(folder.stat().st_mode | 0o011)
+        st_mode = folder.stat().st_mode
+        folder.chmod(st_mode | 0o011)
     try:
         with _no_one():
             assert len(read_history(ledger).entries) == 1
@@ -315,15 +328,18 @@ def test_where_nothing_can_be_written_reading_works(ledger: Ledger) -> None:
 
 
 def test_a_folder_that_is_not_there_is_reported(tmp_path: Path) -> None:
+    folder = tmp_path / "none"
     with pytest.raises(OutputFailed):
-        enter(ledger_in(tmp_path / "none"), calibration_of(0))
+        enter(ledger_in(folder), calibration_of(0))
 
 
 def test_a_folder_may_have_any_name(tmp_path: Path) -> None:
     folder = Path(os.fsdecode(os.fsencode(tmp_path) + b"/b\xff ?#%"))
     folder.mkdir()
     digest = enter(ledger_in(folder), calibration_of(0))
-    assert [one.digest for one in read_history(ledger_in(folder)).entries] == [digest]
+    entries = read_history(ledger_in(folder)).entries
+    digests = [one.digest for one in entries]
+    assert digests == [digest]
 
 
 def test_a_write_of_a_killed_process_is_entered_by_the_next_one(cell: Path) -> None:
@@ -351,7 +367,8 @@ def test_a_write_of_a_killed_process_is_entered_by_the_next_one(cell: Path) -> N
     assert main(["history", str(cell), "--verify"]) == 4
     for _ in range(2):
         enter(ledger, calibration_of(0))
-        assert [(event.who, event.at) for event in history_of(cell).events] == [("anna", BEGIN)]
+        events = history_of(cell).events
+        assert [(event.who, event.at) for event in events] == [("anna", BEGIN)]
         actions = [entry.action for entry in read(ledger.audit)]
         assert actions.count(AuditAction.WRITE_FOUND) == 1
     assert main(["history", str(cell), "--verify"]) == 0
@@ -385,7 +402,9 @@ def test_the_next_write_proves_the_killed_one_before_it(cell: Path) -> None:
         details=details,
     )
     write(ledger, subject, "2" * 64, digest=second, before="1" * 64)
-    assert [event.digest for event in history_of(cell).events] == [first, second]
+    events = history_of(cell).events
+    digests = [event.digest for event in events]
+    assert digests == [first, second]
     write(ledger, subject, "1" * 64, before="2" * 64)
     assert history_of(cell).in_force(subject) == first
     assert main(["history", str(cell), "--verify"]) == 0
@@ -394,7 +413,8 @@ def test_the_next_write_proves_the_killed_one_before_it(cell: Path) -> None:
 def test_another_cell_of_the_same_audit_has_its_own(cell: Path) -> None:
     ledger = ledger_of(cell)
     subject = str(load_cell(cell).controller_path)
-    write(ledger, subject, "0" * 64, digest=enter(ledger, calibration_of(0)))
+    digest = enter(ledger, calibration_of(0))
+    write(ledger, subject, "0" * 64, digest=digest)
     before = history_of(cell)
     calibration = {"sha256": "2" * 64, "cell": "another"}
     details = {"sha256_after": "1" * 64, "calibration": calibration}
@@ -438,7 +458,8 @@ def test_a_calibration_that_cannot_be_read_is_a_finding(
         )
     assert len(history_of(cell).entries) == 1
     assert main(["history", str(cell), "--verify"]) == 4
-    said = " ".join(capsys.readouterr().err.split())
+    error_output = capsys.readouterr().err
+    said = " ".join(error_output.split())
     assert "calibration 000000000000… of entry 2: its document is" in said
     assert "calibration 111111111111… of entry 3: its figures are not those" in said
 
@@ -449,14 +470,14 @@ def test_a_damaged_log_is_reported_by_each_command_that_reads_or_adds_to_it(
 ) -> None:
     """A calibration that is missing changes the judgement of a gain and of its drift."""
     for factor in (1.0, 1.02, 1.01):
-        assert (
-            main(["apply", str(cell), str(calibration_for(cell, factor)), "--yes"]) == ExitCode.OK
-        )
+        calibration_text = str(calibration_for(cell, factor))
+        assert main(["apply", str(cell), calibration_text, "--yes"]) == ExitCode.OK
     ledger = ledger_of(cell)
     assert not read_history(ledger).may_lack
     lines = ledger.audit.read_bytes().splitlines(keepends=True)
+    changed_line = lines[0].replace(b"demo", b"dema", 1)
     damaged = {
-        "edited": [lines[0].replace(b"demo", b"dema", 1), *lines[1:]],
+        "edited": [changed_line, *lines[1:]],
         "first removed": lines[1:],
         "end cut off": lines[:-1],
         "deleted": [],
@@ -480,14 +501,14 @@ def test_a_damaged_log_is_reported_by_each_command_that_reads_or_adds_to_it(
 def test_a_log_without_its_note_is_said_to_be_one(
     cell: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["history", str(cell), "--add", str(calibration_for(cell))]) == ExitCode.OK
+    calibration_text = str(calibration_for(cell))
+    assert main(["history", str(cell), "--add", calibration_text]) == ExitCode.OK
     note = head_file(ledger_of(cell).audit)
     for spoil in (note.unlink, lambda: note.write_text("no digest\n")):
         spoil()
         assert main(["history", str(cell), "--verify"]) == ExitCode.OK
-        assert ("a missing end of the audit log would not be noticed") in " ".join(
-            capsys.readouterr().out.split()
-        )
+        printed = capsys.readouterr().out
+        assert ("a missing end of the audit log would not be noticed") in " ".join(printed.split())
     assert main(["history", str(cell), "--add", str(calibration_for(cell, 1.01))]) == ExitCode.OK
     capsys.readouterr()
     assert main(["history", str(cell), "--verify"]) == ExitCode.OK
@@ -502,10 +523,12 @@ def test_a_path_that_is_not_utf_8_is_in_the_history(
     subject = str(load_cell(cell).controller_path)
     first = enter(ledger, calibration_of(0))
     write(ledger, other, "1" * 64, digest=first)
-    write(ledger, subject, "2" * 64, digest=enter(ledger, calibration_of(1)))
+    digest = enter(ledger, calibration_of(1))
+    write(ledger, subject, "2" * 64, digest=digest)
     acknowledge(ledger, "J4", since=BEGIN, at=BEGIN, who="anna", why="gearbox \udcff")
     history = history_of(cell)
-    assert [event.target for event in history.events] == [other, subject]
+    targets = [event.target for event in history.events]
+    assert targets == [other, subject]
     assert history.in_force(other) == first
     assert main(["history", str(cell), "--verify"]) == 0
     for arguments in (["--axis", "J4"], ["--json"], ["--csv", str(cell.with_suffix(".csv"))]):

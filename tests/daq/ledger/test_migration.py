@@ -43,11 +43,15 @@ WRITERS = ["Ada", "Bert", "Cleo"]
 def cell(tmp_path: Path) -> Path:
     """The demo cell with audit log, history and controller file of the version before."""
     kept = shutil.ignore_patterns("*.jsonl*", "*.sqlite*")
-    shutil.copytree(Path(__file__).parents[3] / "configs", tmp_path / "configs", ignore=kept)
-    cell = tmp_path / "configs" / "cells" / "demo.yaml"
+    configs_folder = Path(__file__).parents[3] / "configs"
+    shutil.copytree(configs_folder, tmp_path / "configs", ignore=kept)
+    cells_folder = tmp_path / "configs" / "cells"
+    cell = cells_folder / "demo.yaml"
     for name in ("demo.audit.jsonl", "demo.history.sqlite"):
         shutil.copy(FILES / name, cell.with_name(name))
-    shutil.copy(FILES / "controller.yaml", cell.parents[1] / "controllers" / "demo.yaml")
+    controllers_folder = cell.parents[1] / "controllers"
+    demo_path = controllers_folder / "demo.yaml"
+    shutil.copy(FILES / "controller.yaml", demo_path)
     return cell
 
 
@@ -69,12 +73,14 @@ def shown(cell: Path, capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
     """What `history --json` prints."""
     capsys.readouterr()
     assert main(["history", str(cell), "--json"]) == ExitCode.OK
-    found: dict[str, Any] = json.loads(capsys.readouterr().out)
+    printed = capsys.readouterr().out
+    found: dict[str, Any] = json.loads(printed)
     return found
 
 
 def writers_of(cell: Path) -> list[str]:
-    return [event.who.split()[0] for event in history_of(cell).events]
+    events = history_of(cell).events
+    return [event.who.split()[0] for event in events]
 
 
 def asides_of(cell: Path) -> list[Path]:
@@ -85,7 +91,8 @@ def test_the_first_command_migrates_it_and_shows_what_the_version_before_showed(
     cell: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     content = stored_of(cell).read_bytes()
-    expected = json.loads((FILES / "history.json").read_text())
+    text = (FILES / "history.json").read_text()
+    expected = json.loads(text)
     assert shown(cell, capsys) == expected
     assert not stored_of(cell).exists()
     (aside,) = asides_of(cell)
@@ -105,11 +112,8 @@ def test_what_reads_only_shows_the_same_and_writes_nothing(cell: Path) -> None:
     assert {path: path.read_bytes() for path in cell.parent.iterdir() if path.is_file()} == before
     migrate(ledger, who="anna", at=BEGIN)
     after = read_history(ledger)
-    assert (after.entries, after.events, after.acknowledgements) == (
-        history.entries,
-        history.events,
-        history.acknowledgements,
-    )
+    expected = (history.entries, history.events, history.acknowledgements)
+    assert (after.entries, after.events, after.acknowledgements) == expected
 
 
 @pytest.mark.parametrize("command", ["apply", "add", "migrate"])
@@ -144,10 +148,13 @@ def test_what_only_the_history_had_gets_into_the_audit(
     (found,) = [one for one in read(audit_of(cell)) if one.action is AuditAction.WRITE_FOUND]
     assert found.details["migrated"] is True
     after = history_of(cell)
-    assert [event.action for event in after.events] == [event.action for event in before.events]
+    expected = [event.action for event in before.events]
+    actions = [event.action for event in after.events]
+    assert actions == expected
     assert after.in_force("/other.yaml") == before.in_force("/other.yaml")
     # An earlier version was run again, and found no history of its own.
-    asides_of(cell)[0].rename(stored_of(cell))
+    first_aside = asides_of(cell)[0]
+    first_aside.rename(stored_of(cell))
     assert shown(cell, capsys)["calibrations"] == 3
     assert writers_of(cell) == [*WRITERS, "kim"]
 
@@ -166,10 +173,12 @@ def test_a_history_of_a_version_whose_audit_has_no_calibrations(
         "DELETE FROM event WHERE number > 1; DELETE FROM acknowledgement; DELETE FROM "
         "sqlite_sequence",
     )
-    digests = {one.digest for one in read_stored(stored_of(cell)).calibrations}
+    calibrations = read_stored(stored_of(cell)).calibrations
+    digests = {one.digest for one in calibrations}
     assert len(digests) == 3
     assert main(["history", str(cell), "--verify"]) == ExitCode.OK
-    assert {one.digest for one in history_of(cell).entries} == digests
+    entries = history_of(cell).entries
+    assert {one.digest for one in entries} == digests
     assert writers_of(cell) == ["Ada"]
 
 
@@ -242,7 +251,8 @@ def test_a_calibration_that_is_damaged_is_reported_and_nothing_is_taken_over(
     change(cell, f"UPDATE calibration SET document = {document}")
     for options in ((), ("--verify",)):
         assert main(["history", str(cell), *options]) == ExitCode.DATA_UNFIT
-        said = " ".join(capsys.readouterr().err.split())
+        error_output = capsys.readouterr().err
+        said = " ".join(error_output.split())
         assert "--migrate" in said
         assert "…: its document is" in said
     assert stored_of(cell).exists()
@@ -269,9 +279,11 @@ def test_a_file_that_is_no_history_is_refused_and_kept(
 ) -> None:
     spoil(stored_of(cell))
     content = stored_of(cell).read_bytes()
-    for options in ((), ("--verify",), ("--add", str(calibration_for(cell)))):
+    calibration_text = str(calibration_for(cell))
+    for options in ((), ("--verify",), ("--add", calibration_text)):
         assert main(["history", str(cell), *options]) == ExitCode.DATA_UNFIT, name
-        assert "--migrate" in " ".join(capsys.readouterr().err.split())
+        error_output = capsys.readouterr().err
+        assert "--migrate" in " ".join(error_output.split())
     # The write-back goes on without it: the gains are judged by the calibration and the
     # controller's file.
     assert main(["apply", str(cell), str(calibration_for(cell))]) == ExitCode.OK
@@ -291,7 +303,8 @@ def test_a_sound_file_that_cannot_be_read_now_is_never_put_aside(
     with closing(sqlite3.connect(stored_of(cell), isolation_level=None)) as other:
         other.execute("BEGIN EXCLUSIVE")
         assert main(["history", str(cell), "--migrate"]) == ExitCode.DATA_UNFIT
-    said = " ".join(capsys.readouterr().err.split())
+    error_output = capsys.readouterr().err
+    said = " ".join(error_output.split())
     assert "SQLITE_BUSY" in said
     assert "try again" in said
     assert asides_of(cell) == []
@@ -313,9 +326,8 @@ def test_a_file_that_keeps_its_name_keeps_no_calibration_out(
 
     with monkeypatch.context() as patch:
         patch.setattr(ledger_module, "set_aside", refuse)
-        assert (
-            main(["history", str(cell), "--add", str(calibration_for(cell, 1.005))]) == ExitCode.OK
-        )
+        calibration_text = str(calibration_for(cell, 1.005))
+        assert main(["history", str(cell), "--add", calibration_text]) == ExitCode.OK
     assert ("keeps its name" in caplog.text) == isinstance(error, PermissionError)
     assert main(["history", str(cell), "--verify"]) == ExitCode.OK
     assert len(history_of(cell).entries) == 4
@@ -371,7 +383,8 @@ def test_an_unfinished_transaction_of_a_killed_writer_is_undone_first(cell: Path
     assert main(["history", str(cell), "--verify"]) == ExitCode.OK
     assert writers_of(cell) == WRITERS
     (aside,) = asides_of(cell)
-    assert aside.read_bytes() == (FILES / "demo.history.sqlite").read_bytes()
+    content = (FILES / "demo.history.sqlite").read_bytes()
+    assert aside.read_bytes() == content
 
 
 def test_one_that_is_locked_for_long_is_reported(
@@ -381,7 +394,8 @@ def test_one_that_is_locked_for_long_is_reported(
     with closing(sqlite3.connect(stored_of(cell), isolation_level=None)) as other:
         other.execute("BEGIN EXCLUSIVE")
         assert main(["history", str(cell)]) == ExitCode.DATA_UNFIT
-        assert "who has it open" in " ".join(capsys.readouterr().err.split())
+        error_output = capsys.readouterr().err
+        assert "who has it open" in " ".join(error_output.split())
         other.execute("ROLLBACK")
     assert main(["history", str(cell)]) == ExitCode.OK
 
@@ -395,7 +409,8 @@ def test_nothing_is_migrated_into_an_audit_that_was_changed(
     if lost == "changed":
         audit.write_bytes(content.replace(b'"who":"Ada', b'"who":"Eve', 1))
     elif lost == "cut off":
-        audit.write_bytes(b"".join(content.splitlines(keepends=True)[:4]))
+        lines = content.splitlines(keepends=True)
+        audit.write_bytes(b"".join(lines[:4]))
     else:
         audit.unlink()
     stored = stored_of(cell).read_bytes()
@@ -405,7 +420,8 @@ def test_nothing_is_migrated_into_an_audit_that_was_changed(
         assert stored_of(cell).read_bytes() == stored
     # What is left is shown all the same, and the write-back goes on.
     assert main(["history", str(cell)]) == ExitCode.OK
-    assert main(["apply", str(cell), str(calibration_for(cell, 1.005)), "--yes"]) == ExitCode.OK
+    calibration_text = str(calibration_for(cell, 1.005))
+    assert main(["apply", str(cell), calibration_text, "--yes"]) == ExitCode.OK
     assert len(history_of(cell).entries) == 4
     assert stored_of(cell).read_bytes() == stored
     assert main(["history", str(cell), "--verify"]) == ExitCode.DATA_UNFIT
@@ -416,9 +432,11 @@ def test_a_cell_whose_gains_are_applied_again_knows_the_old_write(
 ) -> None:
     """The controller has the gains of Ada's calibration; the audit log names another folder."""
     ledger = ledger_of(cell)
-    (first,) = [event for event in read_history(ledger).events if event.who.startswith("Ada")]
+    events = read_history(ledger).events
+    (first,) = [event for event in events if event.who.startswith("Ada")]
     assert first.action is WriteAction.APPLIED
-    assert shown(cell, capsys)["in_force"] == first.digest
+    in_force = shown(cell, capsys)["in_force"]
+    assert in_force == first.digest
 
 
 def test_another_audit_than_the_cells_has_no_history_of_sqlite(cell: Path, tmp_path: Path) -> None:

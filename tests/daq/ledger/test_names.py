@@ -52,8 +52,10 @@ def _other_robot(cell: Cell) -> Cell:
     """The same cell with another drive on J4."""
     axis = cell.axes[3]
     assert axis.identity is not None
-    exchanged = replace(axis, identity=replace(axis.identity, product_code=0x40300))
-    return replace(cell, axes=(*cell.axes[:3], exchanged, *cell.axes[4:]))
+    identity = replace(axis.identity, product_code=0x40300)
+    exchanged = replace(axis, identity=identity)
+    axes = (*cell.axes[:3], exchanged, *cell.axes[4:])
+    return replace(cell, axes=axes)
 
 
 def _made(cell: Cell, week: int, factors: tuple[float, ...] = (1.0,) * 6) -> Calibration:
@@ -69,7 +71,8 @@ def _enter(ledger: Ledger, calibration: Calibration, week: int) -> str:
 
 
 def _named(ledger: Ledger, name: str) -> Ledger:
-    return replace(ledger, cell=replace(ledger.cell, name=name))
+    cell = replace(ledger.cell, name=name)
+    return replace(ledger, cell=cell)
 
 
 @pytest.fixture
@@ -95,8 +98,10 @@ def renamed(ledger: Ledger) -> Ledger:
 
 def test_no_drift_is_computed_over_two_robots(ledger: Ledger) -> None:
     for week in range(3):
-        _enter(ledger, _made(ledger.cell, week), week)
-    other = replace(ledger, cell=_other_robot(ledger.cell))
+        calibration = _made(ledger.cell, week)
+        _enter(ledger, calibration, week)
+    cell = _other_robot(ledger.cell)
+    other = replace(ledger, cell=cell)
     with pytest.raises(
         DataError,
         match=r"drive of J4 with product code 0x40200; expected "
@@ -106,9 +111,10 @@ def test_no_drift_is_computed_over_two_robots(ledger: Ledger) -> None:
     history = read_history(other)
     assert history.entries == ()
     assert watch(history.entries, history.acknowledgements) == ()
-    assert [one.entry.digest for one in history.other_robots] == [
-        one.digest for one in read_history(ledger).entries
-    ]
+    entries = read_history(ledger).entries
+    expected = [one.digest for one in entries]
+    digests = [one.entry.digest for one in history.other_robots]
+    assert digests == expected
     said = str(history.other_robots[0])
     assert (
         "is of another robot with the cell name 'demo': found drive of J4 with product code 0x40200"
@@ -118,15 +124,18 @@ def test_no_drift_is_computed_over_two_robots(ledger: Ledger) -> None:
 
 
 def test_a_calibration_of_another_robot_is_not_entered(ledger: Ledger) -> None:
-    _enter(ledger, _made(ledger.cell, 0), 0)
+    calibration = _made(ledger.cell, 0)
+    _enter(ledger, calibration, 0)
+    cell = _other_robot(ledger.cell)
     with pytest.raises(DataError, match="another robot with the cell name 'demo'"):
-        _enter(ledger, _made(_other_robot(ledger.cell), 1, FALLEN), 1)
+        _enter(ledger, _made(cell, 1, FALLEN), 1)
     assert len(read(ledger.audit)) == 1
 
 
 def test_calibrations_of_earlier_versions_are_compared_as_before(ledger: Ledger) -> None:
     _enter(ledger, calibration_of(0), 0)
-    _enter(ledger, _made(ledger.cell, 1), 1)
+    calibration = _made(ledger.cell, 1)
+    _enter(ledger, calibration, 1)
     history = read_history(ledger)
     assert [entry.robot is None for entry in history.entries] == [True, False]
     assert history.other_robots == ()
@@ -138,30 +147,36 @@ def test_a_renamed_cell_has_its_history_under_the_new_name(ledger: Ledger, renam
     assert read_history(renamed).entries == ()
     assert read_history(renamed).possible_names == ("demo",)
     planned = plan_rename(renamed, "demo")
+    expected = (3, 1, 1, 0)
     assert (
         planned.calibrations,
         planned.writes,
         planned.acknowledgements,
         planned.undescribed,
-    ) == (3, 1, 1, 0)
+    ) == expected
     assert ledger.audit.read_bytes() == lines
     rename_cell(renamed, planned, who="anna", at=LATER)
     # The chain is what it was, and one entry longer.
     assert ledger.audit.read_bytes().startswith(lines)
     assert verify(ledger.audit).holds
-    assert read(ledger.audit)[-1].action is AuditAction.RENAMED
+    action = read(ledger.audit)[-1].action
+    assert action is AuditAction.RENAMED
     after = read_history(renamed)
-    assert [replace(entry, cell="demo", events=()) for entry in after.entries] == [
-        replace(entry, events=()) for entry in before.entries
-    ]
-    assert [event.target for event in after.events] == [drives_of("press")]
+    changed_entries = [replace(entry, cell="demo", events=()) for entry in after.entries]
+    changed_entries_expected = [replace(entry, events=()) for entry in before.entries]
+    assert changed_entries == changed_entries_expected
+    targets = [event.target for event in after.events]
+    assert targets == [drives_of("press")]
     assert after.acknowledgements == before.acknowledgements
     assert after.acceptances == before.acceptances
     assert after.in_force(drives_of("press")) == before.entries[0].digest
-    assert read_standing(renamed, before.entries[0].digest, LATER).state.value == "accepted"
+    digest = before.entries[0].digest
+    standing = read_standing(renamed, digest, LATER)
+    assert standing.state.value == "accepted"
     assert verify_ledger(renamed).complete
     # A change is judged against the baseline of the old name.
-    _enter(renamed, _made(renamed.cell, 11, FALLEN), 11)
+    calibration = _made(renamed.cell, 11, FALLEN)
+    _enter(renamed, calibration, 11)
     history = read_history(renamed)
     (of_j4,) = [one for one in watch(history.entries, history.acknowledgements) if one.axis == "J4"]
     assert len(of_j4.points) == 4
@@ -171,21 +186,28 @@ def test_a_renamed_cell_has_its_history_under_the_new_name(ledger: Ledger, renam
 def test_what_is_entered_under_the_old_name_later_is_of_another_cell(
     ledger: Ledger, renamed: Ledger
 ) -> None:
-    rename_cell(renamed, plan_rename(renamed, "demo"), who="anna", at=LATER)
+    planned = plan_rename(renamed, "demo")
+    rename_cell(renamed, planned, who="anna", at=LATER)
     # The same robot, by a cell file that still has the old name.
+    calibration = _made(ledger.cell, 11)
     with pytest.raises(DataError, match=r"'demo', which this robot had until .*expected 'press'"):
-        _enter(ledger, _made(ledger.cell, 11), 11)
+        _enter(ledger, calibration, 11)
     # Another robot may take the name.
-    other = replace(ledger, cell=_other_robot(ledger.cell))
+    cell = _other_robot(ledger.cell)
+    other = replace(ledger, cell=cell)
     digest = _enter(other, _made(other.cell, 12), 12)
-    assert [entry.digest for entry in read_history(other).entries] == [digest]
+    entries = read_history(other).entries
+    digests = [entry.digest for entry in entries]
+    assert digests == [digest]
     assert len(read_history(renamed).entries) == 3
 
 
 def test_a_cell_may_be_renamed_twice_and_back(ledger: Ledger, renamed: Ledger) -> None:
-    rename_cell(renamed, plan_rename(renamed, "demo"), who="anna", at=LATER)
+    planned = plan_rename(renamed, "demo")
+    rename_cell(renamed, planned, who="anna", at=LATER)
     third = _named(ledger, "press-4")
-    rename_cell(third, plan_rename(third, "press"), who="anna", at=LATER)
+    rename = plan_rename(third, "press")
+    rename_cell(third, rename, who="anna", at=LATER)
     assert len(read_history(third).entries) == 3
     back = plan_rename(ledger, "press-4")
     rename_cell(ledger, back, who="anna", at=LATER)
@@ -198,26 +220,30 @@ def test_a_cell_may_be_renamed_twice_and_back(ledger: Ledger, renamed: Ledger) -
 
 
 def _rename(ledger: Ledger, old: str, week: int) -> None:
-    rename_cell(ledger, plan_rename(ledger, old), who="anna", at=BEGIN + timedelta(weeks=week))
+    planned = plan_rename(ledger, old)
+    rename_cell(ledger, planned, who="anna", at=BEGIN + timedelta(weeks=week))
 
 
 def test_a_name_that_a_rename_has_freed_may_be_that_of_another_cell(ledger: Ledger) -> None:
     """The name that one robot had is another one's by now: each keeps its own calibrations."""
     first = ledger
     second = _named(ledger, "press")
-    of_first = _enter(first, _made(first.cell, 0), 0)
+    calibration = _made(first.cell, 0)
+    of_first = _enter(first, calibration, 0)
     of_second = _enter(second, _made(second.cell, 1, FALLEN), 1)
     line = _named(ledger, "line")
     _rename(line, "press", 2)
     press = _named(ledger, "press")
     _rename(press, "demo", 3)
-    assert [entry.digest for entry in read_history(press).entries] == [of_first]
+    digests = [entry.digest for entry in read_history(press).entries]
+    assert digests == [of_first]
     assert [entry.digest for entry in read_history(line).entries] == [of_second]
     entries = read(press.audit)
     assert former_names(entries, "press") == {"demo"}
     assert former_names(entries, "line") == {"press"}
     again = plan_rename(press, "demo")
-    assert again.entered_at == BEGIN + timedelta(weeks=3)
+    expected = BEGIN + timedelta(weeks=3)
+    assert again.entered_at == expected
 
 
 def test_a_job_that_was_held_for_its_old_name_is_no_history_of_that_name(renamed: Ledger) -> None:
@@ -235,8 +261,10 @@ def test_a_job_that_was_held_for_its_old_name_is_no_history_of_that_name(renamed
 
 def test_a_rename_to_the_name_of_another_robot_is_refused(ledger: Ledger) -> None:
     press = _named(ledger, "press")
-    _enter(ledger, _made(ledger.cell, 0), 0)
-    other = replace(press, cell=_other_robot(press.cell))
+    calibration = _made(ledger.cell, 0)
+    _enter(ledger, calibration, 0)
+    cell = _other_robot(press.cell)
+    other = replace(press, cell=cell)
     _enter(other, _made(other.cell, 0), 0)
     lines = ledger.audit.read_bytes()
     for wanted, name in ((press, "press"), (other, "demo")):
@@ -255,22 +283,26 @@ def test_a_name_that_the_log_does_not_have_is_refused_with_those_that_it_has(
 
 
 def test_nothing_is_renamed_in_a_log_that_was_changed(renamed: Ledger) -> None:
-    renamed.audit.write_bytes(renamed.audit.read_bytes().replace(b"new gearbox", b"old gearbox"))
+    changed_content = renamed.audit.read_bytes().replace(b"new gearbox", b"old gearbox")
+    renamed.audit.write_bytes(changed_content)
     with pytest.raises(DataError, match="not what was written"):
         plan_rename(renamed, "demo")
 
 
 def _sessions_of(folder: Path, cell: str, count: int) -> None:
     for number in range(count):
-        begin(folder, Basis(cell, "c" * 64, ""), BEGIN + timedelta(days=number), GuidedState)
+        configuration_sha256 = "c" * 64
+        basis = Basis(cell, configuration_sha256, "")
+        now = BEGIN + timedelta(days=number)
+        begin(folder, basis, now, GuidedState)
 
 
 def test_sessions_get_the_new_name_unless_they_began_after_the_rename(tmp_path: Path) -> None:
     _sessions_of(tmp_path, "demo", 3)
     _sessions_of(tmp_path, "gantry", 1)
-    count = rename_sessions(
-        [tmp_path, tmp_path / "none"], "demo", "press", BEGIN + timedelta(days=1)
-    )
+    until = BEGIN + timedelta(days=1)
+    folders = [tmp_path, tmp_path / "none"]
+    count = rename_sessions(folders, "demo", "press", until)
     assert count == 2
     assert len(sessions(tmp_path, "press")) == 2
     assert len(sessions(tmp_path, "demo")) == 1
@@ -287,14 +319,16 @@ def test_a_rename_that_is_killed_at_any_system_call_is_completed_by_the_next_one
     def prepared(folder: Path) -> tuple[Ledger, Callable[[], int]]:
         folder.mkdir()
         ledger = ledger_in(folder)
-        _enter(ledger, _made(ledger.cell, 0), 0)
+        calibration = _made(ledger.cell, 0)
+        _enter(ledger, calibration, 0)
         _sessions_of(folder / "sessions", "demo", 3)
         press = _named(ledger, "press")
 
         def rename() -> int:
             planned = plan_rename(press, "demo")
             rename_cell(press, planned, who="anna", at=LATER)
-            rename_sessions([folder / "sessions"], "demo", "press", planned.entered_at or LATER)
+            folders = [folder / "sessions"]
+            rename_sessions(folders, "demo", "press", planned.entered_at or LATER)
             return 0
 
         return press, rename
@@ -337,7 +371,8 @@ def cell_file(checkout: Path, tmp_path: Path) -> Path:
     ledger = Ledger.of(load_cell(path))
     assert ledger is not None
     for week in range(2):
-        _enter(ledger, _made(ledger.cell, week), week)
+        calibration = _made(ledger.cell, week)
+        _enter(ledger, calibration, week)
     _sessions_of(sessions_folder(path), "demo", 1)
     return path
 
@@ -345,16 +380,16 @@ def cell_file(checkout: Path, tmp_path: Path) -> Path:
 def test_the_verb_shows_a_rename_and_makes_it_with_yes(
     cell_file: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
 ) -> None:
-    cell_file.write_text(
-        cell_file.read_text(encoding="utf-8").replace("name: demo", "name: press", 1)
-    )
+    text = cell_file.read_text(encoding="utf-8")
+    cell_file.write_text(text.replace("name: demo", "name: press", 1))
     audit = cell_file.with_name("cell.audit.jsonl")
     lines = audit.read_bytes()
     assert main(["history", str(cell_file)]) == ExitCode.OK
     assert f"`drivegain history {cell_file} --rename demo`" in caplog.text
     capsys.readouterr()
     assert main(["history", str(cell_file), "--rename", "demo"]) == ExitCode.OK
-    said = " ".join(capsys.readouterr().err.split())
+    error_output = capsys.readouterr().err
+    said = " ".join(error_output.split())
     assert (
         "Would rename 'demo' to 'press': 2 calibrations, 0 writes, 0 explained changes, 1 session."
     ) in said
@@ -362,7 +397,8 @@ def test_the_verb_shows_a_rename_and_makes_it_with_yes(
     assert len(sessions(sessions_folder(cell_file), "demo")) == 1
     assert main(["history", str(cell_file), "--rename", "demo", "--yes", "--json"]) == ExitCode.OK
     captured = capsys.readouterr()
-    assert json.loads(captured.out)["calibrations"] == 2
+    document = json.loads(captured.out)
+    assert document["calibrations"] == 2
     assert "drivegain-recalibrate-demo.timer" in captured.err
     assert len(sessions(sessions_folder(cell_file), "press")) == 1
     assert main(["history", str(cell_file), "--verify"]) == ExitCode.OK
@@ -371,9 +407,8 @@ def test_the_verb_shows_a_rename_and_makes_it_with_yes(
     assert present_name(press, "demo", datetime.now(UTC)) == "demo"
     assert present_name(press, "press", BEGIN) == "press"
     # A copy of the cell file with the old name, as a schedule may have.
-    cell_file.write_text(
-        cell_file.read_text(encoding="utf-8").replace("name: press", "name: demo", 1)
-    )
+    changed_text = cell_file.read_text(encoding="utf-8").replace("name: press", "name: demo", 1)
+    cell_file.write_text(changed_text)
     assert main(["history", str(cell_file)]) == ExitCode.OK
     assert "this cell was renamed: found the name 'demo', expected 'press'" in caplog.text
     assert "if it is another robot, give it another name, or another audit log" in caplog.text
@@ -382,16 +417,19 @@ def test_the_verb_shows_a_rename_and_makes_it_with_yes(
 def test_a_twin_that_takes_a_freed_name_learns_how_to_begin_its_own_history(
     ledger: Ledger, renamed: Ledger
 ) -> None:
-    rename_cell(renamed, plan_rename(renamed, "demo"), who="anna", at=LATER)
+    planned = plan_rename(renamed, "demo")
+    rename_cell(renamed, planned, who="anna", at=LATER)
     twin = _made(ledger.cell, 12)
     with pytest.raises(DataError, match="which this robot had until") as caught:
         _enter(ledger, twin, 12)
     assert "if it is another robot, give it another name, or another audit log" in str(caught.value)
     # Either way is one that works.
     named = _named(ledger, "twin")
-    _enter(named, replace(twin, cell="twin"), 12)
+    calibration = replace(twin, cell="twin")
+    _enter(named, calibration, 12)
     assert len(read_history(named).entries) == 1
-    elsewhere = replace(ledger, audit=ledger.audit.with_name("twin.audit.jsonl"))
+    audit = ledger.audit.with_name("twin.audit.jsonl")
+    elsewhere = replace(ledger, audit=audit)
     _enter(elsewhere, twin, 12)
     assert len(read_history(elsewhere).entries) == 1
     assert read_history(elsewhere).renamed is None
@@ -416,7 +454,8 @@ def test_a_rename_finds_the_sessions_that_a_cell_file_of_another_name_has_left(
     assert main(["history", str(press), *absent]) == ExitCode.USAGE
     options = ["--rename", "demo", "--sessions", str(elsewhere)]
     assert main(["history", str(press), *options]) == ExitCode.OK
-    said = " ".join(capsys.readouterr().err.split())
+    error_output = capsys.readouterr().err
+    said = " ".join(error_output.split())
     assert "2 sessions. Nothing was renamed; --yes does it." in said
     assert main(["history", str(press), *options, "--yes"]) == ExitCode.OK
     said = " ".join(capsys.readouterr().err.split())
@@ -428,10 +467,12 @@ def test_a_rename_finds_the_sessions_that_a_cell_file_of_another_name_has_left(
 
 def test_who_adds_or_renames_is_recorded(cell_file: Path) -> None:
     added = cell_file.with_name("calibration.yaml")
-    save_calibration(_made(load_cell(cell_file), 5), added)
+    calibration = _made(load_cell(cell_file), 5)
+    save_calibration(calibration, added)
     audit = cell_file.with_name("cell.audit.jsonl")
     assert main(["history", str(cell_file), "--add", str(added), "--by", "Ada"]) == ExitCode.OK
-    assert read(audit)[-1].action is AuditAction.CALIBRATION_ENTERED
+    action = read(audit)[-1].action
+    assert action is AuditAction.CALIBRATION_ENTERED
     assert read(audit)[-1].who.startswith("Ada")
     text = cell_file.read_text(encoding="utf-8").replace("name: demo", "name: press", 1)
     cell_file.write_text(text, encoding="utf-8")
@@ -455,7 +496,8 @@ def test_an_interrupt_after_an_entry_says_what_was_entered(
         name = "press"
     text = cell_file.read_text(encoding="utf-8").replace("name: demo", f"name: {name}", 1)
     cell_file.write_text(text, encoding="utf-8")
-    save_calibration(_made(load_cell(cell_file), 5), added)
+    calibration = _made(load_cell(cell_file), 5)
+    save_calibration(calibration, added)
     arguments, entering, expected = {
         "--add": ([str(added)], "enter_calibration", f"{added} was entered into"),
         "--rename": (["demo", "--yes"], "rename_cell", "has the rename of 'demo' to 'press'"),
@@ -473,10 +515,12 @@ def test_an_interrupt_after_an_entry_says_what_was_entered(
         return result
 
     monkeypatch.setattr(ledger_module, entering, enter_and_interrupt)
-    before = len(read(cell_file.with_name("cell.audit.jsonl")))
+    path = cell_file.with_name("cell.audit.jsonl")
+    before = len(read(path))
     assert main(["history", str(cell_file), verb, *arguments]) == ExitCode.INTERRUPTED
     assert len(read(cell_file.with_name("cell.audit.jsonl"))) == before + 1
-    said = " ".join(capsys.readouterr().err.split())
+    error_output = capsys.readouterr().err
+    said = " ".join(error_output.split())
     assert expected in said
     assert "no file was written" not in said
 
@@ -490,12 +534,13 @@ def _enter_unchecked(ledger: Ledger, calibration: Calibration, at: datetime) -> 
         "entered": at.isoformat(),
         "figures": figures_of(calibration, digest, at),
     }
+    subject = f"history of {ledger.cell.name}"
     append(
         ledger.audit,
         AuditAction.CALIBRATION_ENTERED,
         at=at,
         who="anna",
-        subject=f"history of {ledger.cell.name}",
+        subject=subject,
         details=details,
     )
     return digest
@@ -510,7 +555,8 @@ def test_calibrations_with_other_axes_or_units_are_counted_and_their_writes_know
     four = replace(four, gains=four.gains[:4])
     milli = _made(ledger.cell, 4)
     first = replace(milli.gains[0], unit="Nm/mA")
-    milli = replace(milli, gains=(first, *milli.gains[1:]))
+    gains = (first, *milli.gains[1:])
+    milli = replace(milli, gains=gains)
     digests = []
     for week, calibration in ((3, four), (4, milli)):
         at = BEGIN + timedelta(weeks=week)
@@ -535,7 +581,8 @@ def test_calibrations_with_other_axes_or_units_are_counted_and_their_writes_know
 def test_the_verb_says_in_what_another_robot_differs(
     cell_file: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
 ) -> None:
-    cell_file.write_text(cell_file.read_text(encoding="utf-8").replace("0x00040200", "0x00040300"))
+    text = cell_file.read_text(encoding="utf-8")
+    cell_file.write_text(text.replace("0x00040200", "0x00040300"))
     assert main(["history", str(cell_file), "--json"]) == ExitCode.OK
     report = json.loads(capsys.readouterr().out)
     assert report["calibrations"] == 0
@@ -545,7 +592,8 @@ def test_the_verb_says_in_what_another_robot_differs(
     assert "no change of a gain is computed with it" in caplog.text
     # Nor may its calibration be entered beside the others.
     own = cell_file.with_name("calibration.yaml")
-    save_calibration(_made(load_cell(cell_file), 5), own)
+    calibration = _made(load_cell(cell_file), 5)
+    save_calibration(calibration, own)
     assert main(["history", str(cell_file), "--add", str(own)]) == ExitCode.DATA_UNFIT
 
 
@@ -554,5 +602,6 @@ def test_the_verb_needs_an_earlier_name(
     options: list[str], cell_file: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["history", str(cell_file), *options]) == ExitCode.USAGE
-    said = " ".join(capsys.readouterr().err.split())
+    error_output = capsys.readouterr().err
+    said = " ".join(error_output.split())
     assert "--rename" in said

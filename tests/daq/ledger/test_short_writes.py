@@ -70,7 +70,8 @@ def test_a_note_keeps_the_entries_that_are_missing_where_the_disk_is_full(
     audit = tmp_path / "audit.jsonl"
     first = _append(audit)
     removed = _append(audit, who="U")
-    audit.write_bytes(audit.read_bytes().splitlines(keepends=True)[0])
+    lines = audit.read_bytes().splitlines(keepends=True)
+    audit.write_bytes(lines[0])
     _append(audit)
     assert noted_heads(audit)[0] == removed.sha256
     # Room for the first of two lines, and a part of the second.

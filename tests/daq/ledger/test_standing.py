@@ -87,11 +87,8 @@ def test_a_write_is_in_force_until_another_one_at_its_place(ledger: Ledger) -> N
     standing = read_standing(ledger, first, NOW)
     assert standing.state is StandingState.WRITTEN
     assert standing.write is not None
-    assert (standing.write.at, standing.write.who, standing.ended) == (
-        BEGIN + timedelta(hours=1),
-        "anna",
-        None,
-    )
+    expected = (BEGIN + timedelta(hours=1), "anna", None)
+    assert (standing.write.at, standing.write.who, standing.ended) == expected
     # A write of other gains elsewhere replaces nothing here.
     write(ledger, COPY, sha256(b"2"), digest=second, at=BEGIN + timedelta(hours=2))
     assert state(ledger, first) is state(ledger, second) is StandingState.WRITTEN
@@ -125,7 +122,8 @@ def test_a_rollback_ends_one_write_and_restores_the_other(ledger: Ledger) -> Non
     restored = read_standing(ledger, first, NOW)
     assert restored.state is StandingState.WRITTEN
     assert restored.write is not None
-    assert restored.write.at == BEGIN + timedelta(hours=2)
+    expected = BEGIN + timedelta(hours=2)
+    assert restored.write.at == expected
 
 
 def test_gains_before_a_write_are_those_that_its_begin_has(ledger: Ledger) -> None:
@@ -146,7 +144,8 @@ def test_gains_before_a_write_are_those_that_its_begin_has(ledger: Ledger) -> No
     )
     ended = {"begun": begun.number}
     append(ledger.audit, AuditAction.APPLIED, at=BEGIN, who="anna", subject=FILE, details=ended)
-    assert read_standing(ledger, digest, NOW).before == {"J1": 32.96}
+    before = read_standing(ledger, digest, NOW).before
+    assert before == {"J1": 32.96}
 
 
 def test_acceptance_is_of_one_calibration_of_one_cell(ledger: Ledger) -> None:
@@ -187,10 +186,11 @@ def test_the_last_write_of_each_place_decides(
     places: dict[str, int] = {}
     ever: set[int] = set()
     for hour, (place, week) in enumerate(steps):
+        content = f"{hour}".encode()
         write(
             ledger,
             place,
-            sha256(f"{hour}".encode()),
+            sha256(content),
             digest=digests[week],
             at=BEGIN + timedelta(hours=hour),
         )

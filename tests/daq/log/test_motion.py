@@ -106,12 +106,14 @@ def test_a_glitch_of_the_encoder_is_refused_and_called_invalid_by_all(
 ) -> None:
     resting, change, when = GLITCHES[kind]
     joint_rad = _joints(resting=resting)
-    sound = _log(tmp_path / "sound.mcap", _samples(joint_rad))
+    path = tmp_path / "sound.mcap"
+    sound = _log(path, _samples(joint_rad))
     load_run(sound)
     assert info_report(sound).valid
     change(joint_rad)
     rows = _samples(joint_rad)
-    log = _log(tmp_path / "a.mcap", rows)
+    a_path = tmp_path / "a.mcap"
+    log = _log(a_path, rows)
     with pytest.raises(PositionImplausible) as refused:
         load_run(log)
     assert refused.value.subject == f"{log}, axis J2"
@@ -125,16 +127,20 @@ def test_a_glitch_of_the_encoder_is_refused_and_called_invalid_by_all(
     assert (described.valid, described.reason) == (False, reason)
     table = export_log(log, tmp_path / "a.csv", TableFormat.CSV)
     bag = export_bag(log, tmp_path / "bag")
-    assert (table.valid, table.reason, bag.valid, bag.reason) == (False, reason, False, reason)
+    expected = (False, reason, False, reason)
+    assert (table.valid, table.reason, bag.valid, bag.reason) == expected
     recorded = RecordedMotion(AXES)
     for row in rows:
         recorded.take(row)
-    readback = Readback(tuple(AxisReadback(name, 0.002) for name in CELL.axis_names))
+    axes = tuple(AxisReadback(name, 0.002) for name in CELL.axis_names)
+    readback = Readback(axes)
     assert recorded.reason(CELL, readback, RATE_HZ) == reason
-    saved = salvage(log.rename(tmp_path / "b.mcap.part"), tmp_path / "saved.mcap")
+    damaged = log.rename(tmp_path / "b.mcap.part")
+    saved = salvage(damaged, tmp_path / "saved.mcap")
     assert (saved.statistics.valid, saved.statistics.reason) == (False, reason)
     assert main(["fit", str(sound), str(saved.log)]) == ExitCode.DATA_UNFIT
-    assert "axis J2: a step of" in " ".join(capsys.readouterr().err.split())
+    error_output = capsys.readouterr().err
+    assert "axis J2: a step of" in " ".join(error_output.split())
 
 
 @pytest.mark.parametrize("verb", ["fit", "residual", "validate", "weigh", "contact"])
@@ -143,13 +149,15 @@ def test_every_verb_refuses_a_glitch(
 ) -> None:
     joint_rad = _joints()
     joint_rad[1500, 1] += GLITCH_RAD
-    log = str(_log(tmp_path / "a.mcap", _samples(joint_rad)))
+    path = tmp_path / "a.mcap"
+    log = str(_log(path, _samples(joint_rad)))
     if verb in {"fit", "residual"}:
         arguments = [log, log]
     else:
         arguments = [str(full_calibration), log]
     assert main([verb, *arguments]) == ExitCode.DATA_UNFIT
-    said = " ".join(capsys.readouterr().err.split())
+    error_output = capsys.readouterr().err
+    said = " ".join(error_output.split())
     assert "a step of" in said
     assert "axis J2" in said
 
@@ -160,25 +168,31 @@ SMALL_GLITCH_RAD = 0.002
 
 def test_a_glitch_that_no_limit_rules_out_is_filled_in_and_the_log_valid(tmp_path: Path) -> None:
     joint_rad = _joints()
-    sound_run, cell = load_run(_log(tmp_path / "sound.mcap", _samples(joint_rad)))
+    sound_path = tmp_path / "sound.mcap"
+    path = _log(sound_path, _samples(joint_rad))
+    sound_run, cell = load_run(path)
     joint_rad[1500:1503, 1] += SMALL_GLITCH_RAD
-    log = _log(tmp_path / "a.mcap", _samples(joint_rad))
+    a_path = tmp_path / "a.mcap"
+    log = _log(a_path, _samples(joint_rad))
     run, _ = load_run(log)
     sound = _differentiated(sound_run, cell)
     data = _differentiated(run, cell)
     (fault,) = data.faults
-    assert (fault.kind, fault.quantity, fault.axis) == (FaultKind.GLITCH, ChannelKind.POSITION, 1)
+    expected = (FaultKind.GLITCH, ChannelKind.POSITION, 1)
+    assert (fault.kind, fault.quantity, fault.axis) == expected
     assert fault.stretches.tolist() == [[1500, 1503]]
     assert fault.size == pytest.approx(SMALL_GLITCH_RAD * CELL.ratio[1, 1], rel=0.01)
     assert sound.faults == ()
-    assert np.abs(data.position_rad - sound.position_rad).max() < 1e-4
+    position_difference_rad = data.position_rad - sound.position_rad
+    assert np.abs(position_difference_rad).max() < 1e-4
     assert info_report(log).valid
 
 
 def _differentiated(run: Run, cell: Cell) -> Dataset:
-    return differentiate(
-        run, model_of(cell).drive_train, Conditioning(standstill_rad_s=(0.03,) * AXES)
-    )
+    drive_train = model_of(cell).drive_train
+    standstill_rad_s = (0.03,) * AXES
+    conditioning = Conditioning(standstill_rad_s=standstill_rad_s)
+    return differentiate(run, drive_train, conditioning)
 
 
 def _frozen(joint_rad: FloatArray, current: NDArray[np.int64]) -> None:
@@ -208,7 +222,8 @@ def test_a_log_that_a_fit_refuses_is_called_invalid_by_all(kind: str, tmp_path: 
         replace(row, current_raw=tuple(own))
         for row, own in zip(moved, current.tolist(), strict=True)
     ]
-    log = _log(tmp_path / "a.mcap", rows)
+    path = tmp_path / "a.mcap"
+    log = _log(path, rows)
     with pytest.raises(DataError) as refused:
         load_run(log)
     assert refused.value.subject == f"{log}, axis J2"
@@ -216,7 +231,8 @@ def test_a_log_that_a_fit_refuses_is_called_invalid_by_all(kind: str, tmp_path: 
     recorded = RecordedMotion(AXES)
     for row in rows:
         recorded.take(row)
-    readback = Readback(tuple(AxisReadback(name, 0.002) for name in CELL.axis_names))
+    axes = tuple(AxisReadback(name, 0.002) for name in CELL.axis_names)
+    readback = Readback(axes)
     reason = f"axis J2: {refused.value.found}"
     assert (described.valid, described.reason) == (False, reason)
     assert recorded.reason(CELL, readback, RATE_HZ) == reason
@@ -225,16 +241,22 @@ def test_a_log_that_a_fit_refuses_is_called_invalid_by_all(kind: str, tmp_path: 
 def test_a_current_that_no_amplifier_sets_is_refused_and_called_invalid(tmp_path: Path) -> None:
     rows = _samples(_joints())
     (first, *others) = rows[1000].current_raw
+    current_raw = (2**30, *others)
+    statusword = (0x1237,) * AXES
+    cycle = rows[1000].cycle
+    time_ns = rows[1000].time_ns
+    position_counts = rows[1000].position_counts
     rows[1000] = Sample(
-        rows[1000].cycle,
-        rows[1000].time_ns,
-        rows[1000].position_counts,
-        (2**30, *others),
-        (0x1237,) * AXES,
+        cycle,
+        time_ns,
+        position_counts,
+        current_raw,
+        statusword,
         0,
     )
     assert abs(first) <= 200
-    log = _log(tmp_path / "a.mcap", rows)
+    path = tmp_path / "a.mcap"
+    log = _log(path, rows)
     with pytest.raises(
         CurrentImplausible,
         match=r"axis J1: found a current of .*at 1 s; expected "
@@ -265,16 +287,16 @@ def test_answers_that_are_missing_are_no_steps(tmp_path: Path) -> None:
     gap = range(1500, 1540)
     joint_rad[1500:1540, 1] = 0.0
     rows = _samples(joint_rad, lambda k: 2 if k in gap else 0)
-    log = write(
-        tmp_path / "a.mcap", demo_content(CHECKOUT), rows, verdict=(False, "40 missing answers")
-    )
+    path = tmp_path / "a.mcap"
+    log = write(path, demo_content(CHECKOUT), rows, verdict=(False, "40 missing answers"))
     run, _ = load_run(log, lossy=LossyLogs.ACCEPTED)
     assert run.valid is not None
     assert not run.valid[1500:1540, 1].any()
     # 22 mrad for each of the 41 periods are too fast all the same
     joint_rad[1540:, 1] += GLITCH_RAD
+    b_path = tmp_path / "b.mcap"
     wrong = write(
-        tmp_path / "b.mcap",
+        b_path,
         demo_content(CHECKOUT),
         _samples(joint_rad, lambda k: 2 if k in gap else 0),
         verdict=(False, "40 missing answers"),
@@ -290,8 +312,10 @@ def test_a_counter_that_wraps_at_32_bits_is_no_step() -> None:
         # The counter of the first motor begins just below its end.
         first = (row.position_counts[0] + 2**31 - 10) % 2**32
         signed = first - 2**32 if first >= 2**31 else first
-        recorded.take(replace(row, position_counts=(signed, *row.position_counts[1:])))
-    readback = Readback(tuple(AxisReadback(name, 0.002) for name in CELL.axis_names))
+        position_counts = (signed, *row.position_counts[1:])
+        recorded.take(replace(row, position_counts=position_counts))
+    axes = tuple(AxisReadback(name, 0.002) for name in CELL.axis_names)
+    readback = Readback(axes)
     assert recorded.reason(CELL, readback, RATE_HZ) == ""
 
 
@@ -310,7 +334,9 @@ def test_an_import_and_a_recording_are_judged_by_one_function(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """Both refuse what `impossible_step` refuses, whatever it is."""
-    log = _log(tmp_path / "a.mcap", _samples(_joints()))
+    path = tmp_path / "a.mcap"
+    rows = _samples(_joints())
+    log = _log(path, rows)
     load_run(log)
 
     def refuse(*_: Any) -> Any:
@@ -325,6 +351,8 @@ def test_an_import_and_a_recording_are_judged_by_one_function(
 def full_calibration(tmp_path: Path) -> Path:
     """A calibration of the demo cell, with every setting of its filter."""
     file = tmp_path / "calibration.yaml"
-    document = Conditioning(standstill_rad_s=(0.03,) * AXES).document()
-    save_calibration(replace(demo_calibration(), filter=document), file)
+    standstill_rad_s = (0.03,) * AXES
+    document = Conditioning(standstill_rad_s=standstill_rad_s).document()
+    calibration = replace(demo_calibration(), filter=document)
+    save_calibration(calibration, file)
     return file

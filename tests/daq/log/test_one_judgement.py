@@ -90,7 +90,9 @@ class MadeUp:
             )
             for k in range(0, len(self.cycle), CHUNK)
         ]
-        genuine = statistics_record(RunStatistics(300, 0, (0,) * 6, valid=True))
+        missing = (0,) * 6
+        statistics = RunStatistics(300, 0, missing, valid=True)
+        genuine = statistics_record(statistics)
         records = [
             HEADER,
             *(attachment_record(name, data) for name, data in start.files.items()),
@@ -132,9 +134,12 @@ def test_a_log_of_several_blocks_lasts_from_its_first_stamp_on(
     start_ns: int, checkout: Path, tmp_path: Path
 ) -> None:
     count = 2 * BLOCK_SAMPLES
-    log = MadeUp(checkout, list(range(count)), [start_ns + k * 1_000_000 for k in range(count)])
+    time_ns = [start_ns + k * 1_000_000 for k in range(count)]
+    cycle = list(range(count))
+    log = MadeUp(checkout, cycle, time_ns)
     log.counted()
-    described = info_report(log.write(tmp_path / "a.mcap"))
+    path = log.write(tmp_path / "a.mcap")
+    described = info_report(path)
     assert described.samples == count
     assert described.stamped_duration_s == pytest.approx((count - 1) * 1e-3)
 
@@ -203,7 +208,8 @@ def test_a_salvage_of_a_log_that_contradicts_itself_is_not_valid_or_refused(
 ) -> None:
     CONTRADICTIONS[kind][0](made)
     try:
-        saved = salvage(made.write(tmp_path / "a.mcap"), tmp_path / "saved.mcap")
+        damaged = made.write(tmp_path / "a.mcap")
+        saved = salvage(damaged, tmp_path / "saved.mcap")
     except LogUnreadable as refused:
         assert "a second" in str(refused)  # nothing of a sound log comes before it
         return
@@ -241,7 +247,8 @@ def test_a_log_that_no_fit_takes_is_called_invalid_by_all(
     assert (described.valid, described.reason) == (False, reason)
     table = export_log(log, tmp_path / "a.csv", TableFormat.CSV)
     bag = export_bag(log, tmp_path / "bag")
-    assert (table.valid, table.reason, bag.valid, bag.reason) == (False, reason, False, reason)
+    expected = (False, reason, False, reason)
+    assert (table.valid, table.reason, bag.valid, bag.reason) == expected
     part = log.rename(tmp_path / "a.mcap.part")
     saved = salvage(part, tmp_path / "saved.mcap")
     assert (saved.statistics.valid, saved.statistics.reason) == (False, reason)
@@ -256,7 +263,8 @@ def test_a_log_that_no_fit_takes_is_called_invalid_by_all(
 
 
 def _serial(made: MadeUp) -> None:
-    tree = json.loads(readback_bytes(demo_content(made.checkout).readback))
+    readback = demo_content(made.checkout).readback
+    tree = json.loads(readback_bytes(readback))
     tree["axes"][0]["drive"]["serial"] = int(ATTACKER_DIGITS)
     made.readback = json.dumps(tree).encode()
 
@@ -287,9 +295,11 @@ def test_a_number_of_400_digits_in_the_summary_is_refused(
 
 def test_a_serial_number_of_400_digits_is_none(made: MadeUp, tmp_path: Path) -> None:
     _serial(made)
-    run, _ = load_run(made.write(tmp_path / "a.mcap"))
+    path = made.write(tmp_path / "a.mcap")
+    run, _ = load_run(path)
     assert run.recording is not None
-    assert run.recording.serials == (None, 7, 7, 7, 7, 7)
+    expected = (None, 7, 7, 7, 7, 7)
+    assert run.recording.serials == expected
 
 
 LARGE: dict[str, tuple[Callable[[MadeUp], object], str]] = {
@@ -333,7 +343,9 @@ def test_a_log_has_no_more_and_no_larger_texts_than_a_recorder_writes(
 
 
 def _messages(channel: int, data: bytes, count: int) -> bytes:
-    return raw_record(5, np.array([channel], "<u2").tobytes() + bytes(20) + data) * count
+    tobytes = np.array([channel], "<u2").tobytes()
+    body = tobytes + bytes(20) + data
+    return raw_record(5, body) * count
 
 
 EVENT = event_bytes(CellEvent(START_NS, None, EventKind.STATE, 1, ""))
@@ -377,7 +389,8 @@ NAMES = st.lists(st.text("A1_+-.", min_size=1, max_size=4), min_size=6, max_size
 @given(NAMES)
 def test_every_axis_keeps_columns_of_its_own(cell: Cell, names: Sequence[str]) -> None:
     axes = tuple(replace(axis, name=name) for axis, name in zip(cell.axes, names, strict=True))
-    assert len(set(column_names(replace(cell, axes=axes)))) == 6
+    changed_cell = replace(cell, axes=axes)
+    assert len(set(column_names(changed_cell))) == 6
 
 
 @pytest.fixture(scope="module")

@@ -46,7 +46,8 @@ def test_what_becomes_of_a_calibration_and_comments_make_no_other_recording(
 def test_nor_does_a_rated_payload(configs: Path) -> None:
     file = configs / DEMO
     before = load_cell(file)
-    file.write_text(file.read_text().replace("robot:\n", "robot:\n  rated_payload_kg: 8\n"))
+    changed_text = file.read_text().replace("robot:\n", "robot:\n  rated_payload_kg: 8\n")
+    file.write_text(changed_text)
     assert load_cell(file).recording_digest == before.recording_digest
 
 
@@ -66,8 +67,10 @@ def test_nor_does_what_a_drive_profile_names_beside_the_samples(configs: Path) -
     before = load_cell(configs / DEMO)
     profile = configs / "drives" / "generic-cia402.yaml"
     text = profile.read_text()
-    entry = next(line for line in text.splitlines(keepends=True) if line.startswith("torque:"))
-    earlier, found, _ = text.replace(entry, "").partition("  torque:\n")
+    lines = text.splitlines(keepends=True)
+    entry = next(line for line in lines if line.startswith("torque:"))
+    changed_text = text.replace(entry, "")
+    earlier, found, _ = changed_text.partition("  torque:\n")
     assert found
     profile.write_text(earlier)
     after = load_cell(configs / DEMO)
@@ -94,11 +97,13 @@ def test_whatever_else_changes_is_another_recording(
     member = {DEMO: "cell.yaml", "robots/tx40.urdf": "robot.urdf"}.get(file, file)
     text = files[member].decode()
     assert was in text
-    after = cell_from_bundle({**files, member: text.replace(was, becomes, 1).encode()})
+    changed_content = text.replace(was, becomes, 1).encode()
+    after = cell_from_bundle({**files, member: changed_content})
     assert after.recording_digest != before.recording_digest
 
 
 def test_a_log_reports_the_same_as_the_files(configs: Path) -> None:
     _said(configs, "policy: {motion: allowed}\n")
     cell = load_cell(configs / DEMO)
-    assert cell_from_bundle(bundle(configs / DEMO)).recording_digest == cell.recording_digest
+    files = bundle(configs / DEMO)
+    assert cell_from_bundle(files).recording_digest == cell.recording_digest

@@ -29,17 +29,20 @@ def _clock(
 ) -> Clock:
     """The clock of these stamps; every row has numbers of its own unless they are given."""
     if numbers is None:
-        numbers = np.arange(float(len(time_s)))[:, None]
+        time_count = float(len(time_s))
+        numbers = np.arange(time_count)[:, None]
     stamps = Stamps(np.asarray(time_s, dtype=np.float64), 0)
     lines = range(2, 2 + len(time_s))
-    return clock_of(Table(Path("run.csv"), (), numbers, "", stamps, lines), wanted, numbers)
+    table = Table(Path("run.csv"), (), numbers, "", stamps, lines)
+    return clock_of(table, wanted, numbers)
 
 
 def _steps(
     rng: np.random.Generator, count: int, steps_ms: tuple[int, ...] = (10, 12)
 ) -> FloatArray:
     """Stamps with random steps [s]."""
-    return np.concatenate(([0.0], np.cumsum(rng.choice(steps_ms, count)))) * 1e-3
+    cumulative = np.cumsum(rng.choice(steps_ms, count))
+    return np.concatenate(([0.0], cumulative)) * 1e-3
 
 
 @example(0.029366597839968218, 4, True, 0.0)
@@ -53,7 +56,8 @@ def test_a_uniform_clock_is_one_with_rounded_stamps_too(
         return
     exact = (np.arange(500) + phase) * period_s / digit_s + 1e-6  # what is whole stays so
     time_s = (np.floor(exact) if down else np.rint(exact)) * digit_s
-    timing = check_stamps(time_s - time_s[0])
+    time_difference_s = time_s - time_s[0]
+    timing = check_stamps(time_difference_s)
     assert not timing.resampled
     assert timing.missing == 0
     assert timing.rate_hz * period_s == pytest.approx(1.0, abs=2.0 * digit_s / (499 * period_s))
@@ -62,16 +66,19 @@ def test_a_uniform_clock_is_one_with_rounded_stamps_too(
 def test_stamps_that_are_uniform_leave_the_samples_alone() -> None:
     time_s = np.arange(100) * 0.004
     clock = _clock(time_s)
-    values = np.random.default_rng(0).normal(size=(100, 2))
+    rng = np.random.default_rng(0)
+    values = rng.normal(size=(100, 2))
     assert clock.positions(values) is values
     assert clock.currents(values) is values
-    assert clock.timing.rate_hz == 99 / time_s[-1]
+    expected = 99 / time_s[-1]
+    assert clock.timing.rate_hz == expected
     assert clock.timing.drift_s < 1e-12
     assert clock.row.tolist() == list(range(100))
 
 
 def test_steps_of_10_and_12_ms() -> None:
-    time_s = _steps(np.random.default_rng(1), 4000)
+    rng = np.random.default_rng(1)
+    time_s = _steps(rng, 4000)
     clock = _clock(time_s)
     timing = clock.timing
     assert timing.resampled
@@ -81,14 +88,17 @@ def test_steps_of_10_and_12_ms() -> None:
     assert timing.drift_s > 10e-3
     assert (timing.missing, timing.duplicates, timing.close) == (0, 0, 0)
     assert len(clock.tick_s) == 4001
-    assert np.diff(clock.tick_s) == pytest.approx(1.0 / timing.rate_hz)
+    tick_steps_s = np.diff(clock.tick_s)
+    assert tick_steps_s == pytest.approx(1.0 / timing.rate_hz)
 
     def motion(at_s: FloatArray) -> FloatArray:
         return np.column_stack([np.sin(4.0 * at_s), np.cos(7.0 * at_s)])
 
-    error = np.abs(clock.positions(motion(time_s)) - motion(clock.tick_s)).max()
+    difference = clock.positions(motion(time_s)) - motion(clock.tick_s)
+    error = np.abs(difference).max()
     assert error < 2e-6  # (ω h)⁴ / 384 of the quicker one, and a little at the ends
-    assert np.abs(motion(time_s) - motion(clock.tick_s)).max() > 100 * error
+    largest_difference = np.abs(motion(time_s) - motion(clock.tick_s)).max()
+    assert largest_difference > 100 * error
     assert (
         np.abs(clock.currents(motion(time_s)) - motion(clock.tick_s)).max()
         <= (7.0 * 0.012) ** 2 / 8
@@ -110,28 +120,33 @@ def test_missing_samples_are_interpolated_and_the_others_stay() -> None:
 @pytest.mark.parametrize("row", [1, 40, 99])
 def test_a_row_that_is_there_twice_counts_once(row: int) -> None:
     rows = np.insert(np.arange(99), row, row - 1)
-    clock = _clock(rows * 0.01, numbers=np.sin(rows)[:, None])
+    time_s = rows * 0.01
+    clock = _clock(time_s, numbers=np.sin(rows)[:, None])
     assert clock.timing.duplicates == 1
     assert not clock.timing.resampled
-    assert np.sin(rows)[clock.row].tolist() == np.sin(np.arange(99)).tolist()
+    rows_sine = np.sin(rows)[clock.row].tolist()
+    expected = np.sin(np.arange(99)).tolist()
+    assert rows_sine == expected
 
 
 def test_a_stamp_that_is_there_twice_with_other_numbers_is_refused() -> None:
+    time_s = np.insert(np.arange(99), 40, 39) * 0.01
     with pytest.raises(
         TableUnfit,
         match=r"run.csv:42, column t: found the stamp of the row above, "
         r"with other numbers",
     ):
-        _clock(np.insert(np.arange(99), 40, 39) * 0.01)
+        _clock(time_s)
 
 
 def test_stamps_that_go_back_are_refused() -> None:
+    time_s = np.concatenate((np.arange(50), np.arange(50))) * 0.01
     with pytest.raises(
         TableUnfit,
         match=r"run.csv:52, column t: found a stamp "
         r"0.49 s before",
     ) as caught:
-        _clock(np.concatenate((np.arange(50), np.arange(50))) * 0.01)
+        _clock(time_s)
     assert "two recordings" in caught.value.remedy
 
 
@@ -148,7 +163,8 @@ def test_gaps(periods: int, allowed: float) -> None:
     time_s = np.concatenate((np.arange(100), 99 + periods + np.arange(100))) * 0.01
     wanted = replace(WANTED, largest_gap_periods=allowed)
     if periods <= allowed:
-        assert _clock(time_s, wanted).timing.missing == periods - 1
+        missing = _clock(time_s, wanted).timing.missing
+        assert missing == periods - 1
         return
     with pytest.raises(
         TableUnfit,
@@ -164,20 +180,25 @@ def test_gaps(periods: int, allowed: float) -> None:
     ("rate_hz", "resampled"), [(100.0, False), (100.001, False), (100.5, True), (125.0, True)]
 )
 def test_a_stated_rate(rate_hz: float, resampled: bool) -> None:
-    clock = _clock(np.arange(1001) * 0.01, replace(WANTED, rate_hz=rate_hz))
+    time_s = np.arange(1001) * 0.01
+    clock = _clock(time_s, replace(WANTED, rate_hz=rate_hz))
     assert clock.timing.rate_hz == rate_hz
     assert clock.timing.resampled is resampled
     if resampled:
-        assert np.diff(clock.tick_s) == pytest.approx(1.0 / rate_hz)
+        tick_steps_s = np.diff(clock.tick_s)
+        assert tick_steps_s == pytest.approx(1.0 / rate_hz)
         assert 10.0 - 1.0 / rate_hz < clock.tick_s[-1] <= 10.0
 
 
 @pytest.mark.parametrize("rate_hz", [49.0, 201.0, 1000.0])
 def test_a_stated_rate_far_from_that_of_the_stamps_is_refused(rate_hz: float) -> None:
+    time_s = np.arange(1001) * 0.01
     with pytest.raises(TableUnfit, match="found stamps at 100 Hz"):
-        _clock(np.arange(1001) * 0.01, replace(WANTED, rate_hz=rate_hz))
+        _clock(time_s, replace(WANTED, rate_hz=rate_hz))
 
 
 def test_a_column_that_is_no_time_is_refused() -> None:
+    numbers = np.zeros((50, 1))
+    time_s = np.zeros(50)
     with pytest.raises(TableUnfit, match="1 different time stamps in 50 rows"):
-        _clock(np.zeros(50), numbers=np.zeros((50, 1)))
+        _clock(time_s, numbers=numbers)

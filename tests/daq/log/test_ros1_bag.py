@@ -69,14 +69,15 @@ def record(
             writer.write(chatter, time_ns, b"\x02\x00\x00\x00hi")
             if second:
                 between_ns = time_ns + STEP_NS // 2
-                writer.write(
-                    other, between_ns, _serialised(row, between_ns, np.zeros(6), np.zeros(6))
-                )
+                position = np.zeros(6)
+                effort = np.zeros(6)
+                writer.write(other, between_ns, _serialised(row, between_ns, position, effort))
     return path
 
 
 def _serialised(row: int, time_ns: int, position: Any, effort: Any) -> bytes:
-    header = HEADER(row, STAMP(*divmod(time_ns, 10**9)), "base")
+    stamp = STAMP(*divmod(time_ns, 10**9))
+    header = HEADER(row, stamp, "base")
     message = STATE(header, list(JOINTS), position, np.zeros(0), effort)
     return bytes(TYPES.serialize_ros1(message, JOINTS_SCHEMA))
 
@@ -85,7 +86,8 @@ def _serialised(row: int, time_ns: int, position: Any, effort: Any) -> bytes:
 def test_a_bag_of_ros_1_has_the_same_numbers(
     compression: Writer.CompressionFormat | None, tmp_path: Path
 ) -> None:
-    bag = record(tmp_path / "run.bag", compression)
+    path = tmp_path / "run.bag"
+    bag = record(path, compression)
     assert reader_of(bag) is read_bag
     assert_whole(read(bag))
     renamed = bag.rename(tmp_path / "recording")
@@ -95,7 +97,8 @@ def test_a_bag_of_ros_1_has_the_same_numbers(
 
 def test_the_nodes_that_publish_the_same_joints_are_named(tmp_path: Path) -> None:
     """Frame, joints and fields are the same; the bag knows the nodes."""
-    bag = record(tmp_path / "run.bag", second=True)
+    path = tmp_path / "run.bag"
+    bag = record(path, second=True)
     with pytest.raises(
         TableUnfit,
         match=r"1: /arm_driver, position and effort .*; 2: "

@@ -81,13 +81,21 @@ def _broken_off(path: Path, checkout: Path, *events: CellEvent) -> Path:
 
 
 def _same(found: SampleBlock, count: int) -> bool:
+    cycles = [s.cycle for s in ROWS[:count]]
+    cycle = np.array(cycles, dtype=np.uint64)
+    position_counts = np.array([s.position_counts for s in ROWS[:count]], dtype=np.int32)
+    current_raw = np.array([s.current_raw for s in ROWS[:count]], dtype=np.int32)
+    statuswords = [s.statusword for s in ROWS[:count]]
+    statusword = np.array(statuswords, dtype=np.uint16)
+    missing = np.array([s.missing for s in ROWS[:count]], dtype=np.uint32)
+    time_ns = np.array([s.time_ns for s in ROWS[:count]])
     wanted = SampleBlock(
-        np.array([s.cycle for s in ROWS[:count]], dtype=np.uint64),
-        np.array([s.time_ns for s in ROWS[:count]]),
-        np.array([s.position_counts for s in ROWS[:count]], dtype=np.int32),
-        np.array([s.current_raw for s in ROWS[:count]], dtype=np.int32),
-        np.array([s.statusword for s in ROWS[:count]], dtype=np.uint16),
-        np.array([s.missing for s in ROWS[:count]], dtype=np.uint32),
+        cycle,
+        time_ns,
+        position_counts,
+        current_raw,
+        statusword,
+        missing,
     )
     return all(
         np.array_equal(getattr(found, name), getattr(wanted, name))
@@ -118,7 +126,8 @@ def test_at_most_the_last_150_ms_are_not_on_disk_when_a_recorder_is_killed(
     of 1 ms.
     """
     content = demo_content(checkout)
-    with LogWriter(tmp_path / "run.mcap", content, joints, clock_ns=lambda: 0) as log:
+    path = tmp_path / "run.mcap"
+    with LogWriter(path, content, joints, clock_ns=lambda: 0) as log:
         for number, sample in enumerate(ROWS, start=1):
             log.write(sample)
             if number in {2, 3, 151, 152, 153, 400, 699}:
@@ -145,7 +154,8 @@ def test_a_process_that_is_killed_loses_no_more(tmp_path: Path, checkout: Path) 
     )
     done = subprocess.run([sys.executable, "-c", script], cwd=checkout, check=False)
     assert done.returncode == -9
-    saved = salvage(tmp_path / "run.mcap.part", tmp_path / "saved.mcap")
+    damaged = tmp_path / "run.mcap.part"
+    saved = salvage(damaged, tmp_path / "saved.mcap")
     assert 437 - 150 <= saved.statistics.samples <= 437
     assert _same(read_log(saved.log).samples, saved.statistics.samples)
 
@@ -171,7 +181,9 @@ def test_every_cut_gives_a_beginning_or_a_named_error(part: Path, tmp_path: Path
 
 
 def test_the_damaged_end_of_a_finished_log_is_left_out(tmp_path: Path, checkout: Path) -> None:
-    data = bytearray(write(tmp_path / "whole.mcap", demo_content(checkout), ROWS).read_bytes())
+    path = tmp_path / "whole.mcap"
+    content = write(path, demo_content(checkout), ROWS).read_bytes()
+    data = bytearray(content)
     reader = LogReader(tmp_path / "whole.mcap")
     list(reader.until_damage())
     data[reader.whole_bytes * 3 // 4] ^= 1
@@ -187,9 +199,11 @@ def test_the_damaged_end_of_a_finished_log_is_left_out(tmp_path: Path, checkout:
 
 
 def test_a_whole_log_needs_no_salvage(tmp_path: Path, checkout: Path) -> None:
+    path = tmp_path / "whole.mcap"
+    damaged = write(path, demo_content(checkout), ROWS[:5])
     with pytest.raises(UsageError, match="a whole log"):
         salvage(
-            write(tmp_path / "whole.mcap", demo_content(checkout), ROWS[:5]),
+            damaged,
             tmp_path / "saved.mcap",
         )
 
@@ -201,11 +215,11 @@ def test_a_recorder_that_died_before_it_gave_the_log_its_name(
     because the reason of its death is unknown.
     """
     part = tmp_path / "run.mcap.part"
-    write(
-        tmp_path / "whole.mcap", demo_content(checkout), ROWS, verdict=(False, "3 late answers")
-    ).rename(part)
+    path = tmp_path / "whole.mcap"
+    write(path, demo_content(checkout), ROWS, verdict=(False, "3 late answers")).rename(part)
     assert read_log(part).partial
-    log = read_log(salvage(part, tmp_path / "saved.mcap").log)
+    log_path = salvage(part, tmp_path / "saved.mcap").log
+    log = read_log(log_path)
     assert (log.partial, log.statistics.valid, log.statistics.reason) == (
         True,
         False,
@@ -222,9 +236,8 @@ def test_a_running_recording_is_left_alone(part: Path, tmp_path: Path) -> None:
 
 
 def test_the_writer_holds_that_lock(tmp_path: Path, checkout: Path) -> None:
-    with LogWriter(
-        tmp_path / "run.mcap", demo_content(checkout), joints, clock_ns=lambda: 0
-    ) as log:
+    path = tmp_path / "run.mcap"
+    with LogWriter(path, demo_content(checkout), joints, clock_ns=lambda: 0) as log:
         log.write(ROWS[0])
         log.flush()
         with pytest.raises(UsageError, match="still runs"):
@@ -245,9 +258,11 @@ def test_nothing_can_be_saved_of_nothing(tmp_path: Path, checkout: Path) -> None
     with pytest.raises(LogIncomplete, match="no samples") as refused:
         salvage(empty, tmp_path / "saved.mcap")
     assert "salvage" not in refused.value.remedy  # it is what has just been tried
-    write(tmp_path / "none.mcap", demo_content(checkout), []).rename(tmp_path / "none.mcap.part")
+    path = tmp_path / "none.mcap"
+    write(path, demo_content(checkout), []).rename(tmp_path / "none.mcap.part")
+    damaged = tmp_path / "none.mcap.part"
     with pytest.raises(LogIncomplete, match="no samples"):
-        salvage(tmp_path / "none.mcap.part", tmp_path / "saved.mcap")
+        salvage(damaged, tmp_path / "saved.mcap")
 
 
 @pytest.mark.parametrize(
@@ -258,7 +273,9 @@ def test_a_recording_that_ended_in_a_fault_is_invalid_too(
     kind: EventKind, valid: bool, tmp_path: Path, checkout: Path
 ) -> None:
     fault = CellEvent(START_NS, 2, kind, 0x8130, "node 3")
-    saved = salvage(_broken_off(tmp_path / "run.mcap", checkout, fault), tmp_path / "saved.mcap")
+    path = tmp_path / "run.mcap"
+    damaged = _broken_off(path, checkout, fault)
+    saved = salvage(damaged, tmp_path / "saved.mcap")
     assert saved.statistics.valid is valid
     assert ("node 3" in saved.statistics.reason) is not valid
 
@@ -302,15 +319,19 @@ def test_the_reader_is_reported_and_the_calibration_says_so(
 
 def test_nothing_of_it_reaches_a_controller() -> None:
     good = demo_calibration()
-    partial = replace(good, sources=(good.sources[0], replace(good.sources[1], partial=True)))
+    changed_source = replace(good.sources[1], partial=True)
+    sources = (good.sources[0], changed_source)
+    partial = replace(good, sources=sources)
     again = decode_calibration(encode_calibration(partial), "calibration.yaml")
     assert again == partial
     edit = Edit(subject="", before=b"", after=b"")
     now = datetime(2025, 1, 2, tzinfo=UTC)
-    assert not check_gates(GateContext(Request(good, now), edit))
-    assert [refusal.gate for refusal in check_gates(GateContext(Request(again, now), edit))] == [
-        Gate.PARTIAL
-    ]
+    request = Request(good, now)
+    context = GateContext(request, edit)
+    assert not check_gates(context)
+    gate_context = GateContext(Request(again, now), edit)
+    gates = [refusal.gate for refusal in check_gates(gate_context)]
+    assert gates == [Gate.PARTIAL]
     assert [source["partial"] for source in as_document(again)["sources"]] == [False, True]
 
 
@@ -318,21 +339,21 @@ def test_calibrations_of_earlier_versions_have_no_partial_sources() -> None:
     document = yaml.safe_load(encode_calibration(demo_calibration()))
     for source in document["sources"]:
         del source["partial"]
-    document["digests"]["sources"] = hashlib.sha256(
-        json.dumps(document["sources"], sort_keys=True, separators=(",", ":")).encode()
-    ).hexdigest()
-    assert (
-        decode_calibration(yaml.safe_dump(document, sort_keys=False).encode(), "calibration.yaml")
-        == demo_calibration()
-    )
+    text = json.dumps(document["sources"], sort_keys=True, separators=(",", ":"))
+    document["digests"]["sources"] = hashlib.sha256(text.encode()).hexdigest()
+    content = yaml.safe_dump(document, sort_keys=False).encode()
+    assert decode_calibration(content, "calibration.yaml") == demo_calibration()
 
 
 def test_apply_ends_with_3(
     tmp_path: Path, checkout: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     good = demo_calibration()
+    changed_source = replace(good.sources[0], partial=True)
+    sources = (changed_source,)
+    calibration = replace(good, sources=sources)
     save_calibration(
-        replace(good, sources=(replace(good.sources[0], partial=True),)),
+        calibration,
         tmp_path / "calibration.yaml",
     )
     cell = str(checkout / "configs/cells/demo.yaml")
@@ -344,7 +365,8 @@ def test_apply_ends_with_3(
         "--configuration-changed",
     ]
     assert main(command) == ExitCode.CALIBRATION_REFUSED
-    assert "never finished" in " ".join(capsys.readouterr().err.split())
+    error_output = capsys.readouterr().err
+    assert "never finished" in " ".join(error_output.split())
 
 
 def test_the_verb(part: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -353,19 +375,16 @@ def test_the_verb(part: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     assert "drivegain salvage" in capsys.readouterr().err
     assert main(["salvage", str(part), "--out", str(out), "--json"]) == ExitCode.OK
     document = json.loads(capsys.readouterr().out)
+    expected = (700, True, True, 0)
     assert (
         document["samples"],
         document["partial"],
         document["valid"],
         document["left_out_bytes"],
-    ) == (
-        700,
-        True,
-        True,
-        0,
-    )
+    ) == expected
     assert main(["info", str(out), "--json"]) == ExitCode.OK
-    assert json.loads(capsys.readouterr().out)["partial"] is True
+    printed = capsys.readouterr().out
+    assert json.loads(printed)["partial"] is True
     assert main(["salvage", str(part), "--out", str(out)]) == ExitCode.USAGE
 
 
@@ -385,6 +404,7 @@ def test_a_log_that_is_no_regular_file_is_refused(what: str, tmp_path: Path) -> 
 def test_a_salvage_that_cannot_write_does_not_ask_for_a_recording(
     part: Path, tmp_path: Path
 ) -> None:
+    saved_path = tmp_path / "none" / "saved.mcap"
     with pytest.raises(OutputFailed, match="nothing was written") as caught:
-        salvage(part, tmp_path / "none" / "saved.mcap")
+        salvage(part, saved_path)
     assert "record again" not in str(caught.value)

@@ -28,7 +28,8 @@ def decoded(tmp_path_factory: pytest.TempPathFactory, checkout: Path) -> dict[st
     """Messages of a log by topic."""
     event = CellEvent(START_NS, 2, EventKind.EMCY, 0x8611, "node 3: following error")
     rows = samples([[100 * row + axis for axis in range(AXES)] for row in range(ROWS)])
-    log = write(tmp_path_factory.mktemp("log") / "bare.mcap", demo_content(checkout), rows, [event])
+    path = tmp_path_factory.mktemp("log") / "bare.mcap"
+    log = write(path, demo_content(checkout), rows, [event])
     messages: dict[str, list[Any]] = defaultdict(list)
     with log.open("rb") as stream:
         reader = make_reader(stream, validate_crcs=True, decoder_factories=[DecoderFactory()])
@@ -38,16 +39,16 @@ def decoded(tmp_path_factory: pytest.TempPathFactory, checkout: Path) -> dict[st
 
 
 def test_the_messages_are_those_that_were_written(decoded: dict[str, list[Any]]) -> None:
-    assert set(decoded) == {
+    expected = {
         "/cell/samples",
         "/cell/events",
         "/joint_states",
         "/cell/currents",
         "/robot_description",
     }
-    assert [list(message.position_counts) for message in decoded["/cell/samples"]] == [
-        [100 * row + axis for axis in range(AXES)] for row in range(ROWS)
-    ]
+    assert set(decoded) == expected
+    position_counts = [list(message.position_counts) for message in decoded["/cell/samples"]]
+    assert position_counts == [[100 * row + axis for axis in range(AXES)] for row in range(ROWS)]
     first = decoded["/cell/samples"][0]
     assert first.stamp.sec * 10**9 + first.stamp.nanosec == START_NS
     (event,) = decoded["/cell/events"]
@@ -57,20 +58,20 @@ def test_the_messages_are_those_that_were_written(decoded: dict[str, list[Any]])
         0x8611,
         "node 3: following error",
     )
-    assert list(decoded["/joint_states"][0].name) == [f"J{number}" for number in range(1, AXES + 1)]
+    first_joint_state = decoded["/joint_states"][0]
+    assert list(first_joint_state.name) == [f"J{number}" for number in range(1, AXES + 1)]
 
 
 def _foxglove_paths() -> list[str]:
-    layout = json.loads((VIEWERS / "foxglove.json").read_text(encoding="utf-8"))
+    text = (VIEWERS / "foxglove.json").read_text(encoding="utf-8")
+    layout = json.loads(text)
     found = []
     for panel in layout["configById"].values():
         layers = panel.get("layers", {}).values()
-        found += [layer["topic"] for layer in layers if "topic" in layer] + list(
-            panel.get("topics", ())
-        )
-        found += [path["value"] for path in panel.get("paths", ())] + [
-            panel[key] for key in ("topicPath",) if key in panel
-        ]
+        topics = [layer["topic"] for layer in layers if "topic" in layer]
+        found += topics + list(panel.get("topics", ()))
+        panels = [panel[key] for key in ("topicPath",) if key in panel]
+        found += [path["value"] for path in panel.get("paths", ())] + panels
     return found
 
 
@@ -87,7 +88,8 @@ def test_every_path_of_the_foxglove_layout_leads_to_something(
     # Of the live stream alone, in messages of one type
     if topic in ("/cell/predicted", "/cell/residual"):
         topic = "/cell/currents"
-    assert _walk(decoded[topic][0], re.findall(r"\w+|\[\d+\]", rest)) is not None
+    steps = re.findall(r"\w+|\[\d+\]", rest)
+    assert _walk(decoded[topic][0], steps) is not None
 
 
 @pytest.mark.parametrize("curve", _plotjuggler_curves())
@@ -116,7 +118,8 @@ def _walk(value: Any, steps: list[str]) -> Any:
 
 
 def test_every_panel_of_the_foxglove_layout_is_placed_once() -> None:
-    layout = json.loads((VIEWERS / "foxglove.json").read_text(encoding="utf-8"))
+    text = (VIEWERS / "foxglove.json").read_text(encoding="utf-8")
+    layout = json.loads(text)
 
     def leaves(node: Any) -> list[str]:
         if isinstance(node, str):

@@ -72,9 +72,10 @@ CALIBRATION = replace(demo_calibration(), gains=GAINS, relative_error_percent=ER
 def cell(checkout: Path) -> Cell:
     """The demo cell, with long names."""
     demo = load_cell(checkout / "configs/cells/demo.yaml")
+    axes = tuple(replace(axis, name=name) for axis, name in zip(demo.axes, AXES, strict=False))
     return replace(
         demo,
-        axes=tuple(replace(axis, name=name) for axis, name in zip(demo.axes, AXES, strict=False)),
+        axes=axes,
     )
 
 
@@ -94,13 +95,16 @@ def series(
 
 
 def _scan(cell: Cell, _: Any) -> Iterator[RenderableType]:
-    yield bus_views.scan_table([_node(number) for number in range(14)])
+    nodes = [_node(number) for number in range(14)]
+    yield bus_views.scan_table(nodes)
 
 
 def _node(number: int) -> ScannedNode:
+    bus = f"bus-{number % 2}"
+    node_id = 101 + number
     return ScannedNode(
-        bus=f"bus-{number % 2}",
-        node_id=101 + number,
+        bus=bus,
+        node_id=node_id,
         axis=AXES[number],
         vendor_id=0xFFFFFFFF,
         product_code=0xFFFFFFFE,
@@ -125,16 +129,22 @@ def _monitor(cell: Cell, _: Any) -> Iterator[RenderableType]:
         lost=12345678,
         delay_s=1.2,
     )
-    reading = CellReading(ReadingSource.ASKED, 0.5, (axis,) * 6, 1000.0, ((0,) * 9,), ())
+    frames = ((0,) * 9,)
+    axes = (axis,) * 6
+    reading = CellReading(ReadingSource.ASKED, 0.5, axes, 1000.0, frames, ())
     current = RecentCurrent(-12.345, -11.234, 0.123, 1.234, 0.99, True)
+    position = [-3.126 - number for number in range(6)]
+    prediction = CellPrediction(payload="disc", remark="", axes=[current] * 6)
+    ampere = [12.345 / 32768] * 6
     watched = WatchedCell(
         reading,
-        position=[-3.126 - number for number in range(6)],
-        ampere=[12.345 / 32768] * 6,
+        position=position,
+        ampere=ampere,
         events=(),
-        prediction=CellPrediction(payload="disc", remark="", axes=[current] * 6),
+        prediction=prediction,
     )
-    yield bus_views.monitor_view(bus_views.monitor_report(cell, watched))
+    report = bus_views.monitor_report(cell, watched)
+    yield bus_views.monitor_view(report)
 
 
 def _comparison(cell: Cell, _: Any) -> Iterable[RenderableType]:
@@ -147,8 +157,9 @@ def _comparison(cell: Cell, _: Any) -> Iterable[RenderableType]:
 
 def _turns(cell: Cell, _: Any) -> Iterator[RenderableType]:
     after: Any = None  # the table needs nothing of it
+    effect = SimpleNamespace(name="position-dependent-friction")
     finding: Any = SimpleNamespace(
-        effect=SimpleNamespace(name="position-dependent-friction"),
+        effect=effect,
         axis=5,
         probability=0.123,
         folds_better=0.99,
@@ -157,13 +168,18 @@ def _turns(cell: Cell, _: Any) -> Iterator[RenderableType]:
         error_after_percent=112.34,
         passed=True,
     )
-    step = Step((finding,) * 6, (), np.ones(6), None, after)
+    findings = (finding,) * 6
+    limits_nm = np.ones(6)
+    step = Step(findings, (), limits_nm, None, after)
     fitted: Any = SimpleNamespace(steps=(step,), cell=cell)
     return residual.turns_view(fitted)
 
 
 def _validation(cell: Cell, _: Any) -> Iterator[RenderableType]:
-    measured = np.random.default_rng(1).normal(size=(14, 50))
+    rng = np.random.default_rng(1)
+    measured = rng.normal(size=(14, 50))
+    use = np.ones(measured.shape, dtype=bool)
+    predicted_nm = 0.9 * measured
     one: Any = SimpleNamespace(
         run="a run with a long name, 2026-03-02",
         log=Path("run.mcap"),
@@ -171,29 +187,36 @@ def _validation(cell: Cell, _: Any) -> Iterator[RenderableType]:
         data_use=DataUse.HOLDOUT,
         same_configuration=True,
         measured_nm=measured,
-        predicted_nm=0.9 * measured,
-        use=np.ones(measured.shape, dtype=bool),
+        predicted_nm=predicted_nm,
+        use=use,
     )
     checked = SimpleNamespace(run="run-1", condition=1234.0, left_out="")
+    runs = (checked,) * 12
     found: Any = SimpleNamespace(
-        validations=(one, one), diagnoses=(), runs=(checked,) * 12, calibrations=("ml",), weighed=()
+        validations=(one, one), diagnoses=(), runs=runs, calibrations=("ml",), weighed=()
     )
-    return validation.validation_view(replace(CALIBRATION, filter=Conditioning().document()), found)
+    calibration = replace(CALIBRATION, filter=Conditioning().document())
+    return validation.validation_view(calibration, found)
 
 
 def _weighed(cell: Cell, _: Any) -> Iterator[RenderableType]:
+    centre_m = (np.full(3, -0.12345), np.full(3, 0.000123))
+    inertia_kg_m2 = (np.full(6, 0.0123456), np.full(6, 0.00000123))
+    identifiable = np.ones(10, dtype=bool)
+    std = np.full(10, 0.00000123)
+    grid = np.linspace(-0.0123456, 12.3, 10)
     body: Any = SimpleNamespace(
-        centre_m=(np.full(3, -0.12345), np.full(3, 0.000123)),
-        inertia_kg_m2=(np.full(6, 0.0123456), np.full(6, 0.00000123)),
+        centre_m=centre_m,
+        inertia_kg_m2=inertia_kg_m2,
         mass_kg=12.34567,
         mass_std_kg=0.00123,
         mass_reference_std_kg=0.00045,
         complete=True,
         moves=123,
         error=ERROR,
-        values=np.linspace(-0.0123456, 12.3, 10),
-        std=np.full(10, 0.00000123),
-        identifiable=np.ones(10, dtype=bool),
+        values=grid,
+        std=std,
+        identifiable=identifiable,
     )
     found: Any = SimpleNamespace(cell=cell, body=body, declared_kg=12.3, bare=(), help=())
     return weighing_views.weighed_view(found)
@@ -205,63 +228,78 @@ def _contact(cell: Cell, _: Any) -> Iterator[RenderableType]:
     )
     n = len(cell.axes)
     ones = np.ones((n, 9))
-    band = SimpleNamespace(quiet_s=np.full(n, 12345.0), threshold=np.ones(n), alarms_per_hour=0.1)
+    quiet_s = np.full(n, 12345.0)
+    threshold = np.ones(n)
+    band = SimpleNamespace(quiet_s=quiet_s, threshold=threshold, alarms_per_hour=0.1)
     band.correlation_s = np.ones(n)
     band.factor = np.ones(n)
     band.scale = ones
+    contacts = (contact,) * 20
+    band_nm = 1.234e4 * ones
+    threshold_nm = 2.345e4 * ones
+    torque_nm = 3.456e5 * ones
+    time_s = np.arange(9.0)
     found: Any = SimpleNamespace(
         band=band,
-        band_nm=1.234e4 * ones,
-        threshold_nm=2.345e4 * ones,
-        torque_nm=3.456e5 * ones,
+        band_nm=band_nm,
+        threshold_nm=threshold_nm,
+        torque_nm=torque_nm,
         use=ones > 0,
         left_out=0,
         from_itself=False,
-        contacts=(contact,) * 20,
-        time_s=np.arange(9.0),
+        contacts=contacts,
+        time_s=time_s,
     )
     return weighing_views.contact_view(found, cell)
 
 
 def _urdf(cell: Cell, _: Any) -> Iterator[RenderableType]:
-    body = SimpleNamespace(centre_m=(-1.234, 2.345, -3.456), mass_kg=123.0)
+    centre_m = (-1.234, 2.345, -3.456)
+    body = SimpleNamespace(centre_m=centre_m, mass_kg=123.0)
     update: Any = SimpleNamespace(body=body, damping=1.23e-5, friction=4.56e-5)
+    robot = SimpleNamespace(joints=(), closures=())
+    drive_train = SimpleNamespace(coupled=())
     model = SimpleNamespace(
-        robot=SimpleNamespace(joints=(), closures=()),
-        drive_train=SimpleNamespace(coupled=()),
+        robot=robot,
+        drive_train=drive_train,
         columns=(),
     )
     parameters = SimpleNamespace(torque_change_percent=ERROR, exact=True, model=model)
+    simple_namespace = SimpleNamespace(parameters=parameters)
     choice: Any = SimpleNamespace(
-        robot=SimpleNamespace(parameters=parameters),
+        robot=simple_namespace,
         model=model,
         chosen_by=ChosenBy.NEAREST_BODIES,
         assumed=(),
     )
-    updated: Any = SimpleNamespace(links={axis: f"link-of-{axis}" for axis in AXES}, merged=())
-    return urdf_views.urdf_view(CALIBRATION, choice, dict.fromkeys(AXES, update), updated, None)
+    links = {axis: f"link-of-{axis}" for axis in AXES}
+    updated: Any = SimpleNamespace(links=links, merged=())
+    updates = dict.fromkeys(AXES, update)
+    return urdf_views.urdf_view(CALIBRATION, choice, updates, updated, None)
 
 
 def _mjcf(cell: Cell, _: Any) -> Iterator[RenderableType]:
+    centre_m = (-1.2345, 2.3456, -3.4567)
     joint = SimpleNamespace(
         mass_kg=123.456,
-        centre_m=(-1.2345, 2.3456, -3.4567),
+        centre_m=centre_m,
         armature=1.23e-5,
         damping=4.56e-5,
         friction=1234.5,
     )
     left = SimpleNamespace(name="off12", value=-1.234e-5, unit="Nm")
+    joints = [SimpleNamespace(name=axis, **vars(joint)) for axis in AXES]
+    actuators = [
+        SimpleNamespace(axis=one.axis, acts_on=f"tendon {one.axis}", gear=one.value, unit="Nm/A")
+        for one in GAINS
+    ]
+    parameters = [SimpleNamespace(name="Ixx12", basis="prior")]
     report: Any = SimpleNamespace(
-        joints=[SimpleNamespace(name=axis, **vars(joint)) for axis in AXES],
-        actuators=[
-            SimpleNamespace(
-                axis=one.axis, acts_on=f"tendon {one.axis}", gear=one.value, unit="Nm/A"
-            )
-            for one in GAINS
-        ],
+        joints=joints,
+        actuators=actuators,
         torque_change_percent=ERROR,
         exact=False,
-        parameters=[SimpleNamespace(name="Ixx12", basis="prior")],
+        parameters=parameters,
         chosen_by="bodies nearest to the URDF",
         assumed_links=[],
         not_in_mjcf=[left],
@@ -275,28 +313,34 @@ def _mjcf(cell: Cell, _: Any) -> Iterator[RenderableType]:
 
 
 def _full(cell: Cell, _: Any) -> Iterator[RenderableType]:
+    full_parameter = FullParameter(
+        "Ixx12", -1.2345e-17, 1.2e-5, "kg m²", "prior", 1.0, 123.45, 1.2e-5
+    )
     parameters = (
-        FullParameter("Ixx12", -1.2345e-17, 1.2e-5, "kg m²", "prior", 1.0, 123.45, 1.2e-5),
+        full_parameter,
         FullParameter("fvm12", 1.234e-5, 1.2e-6, "Nm/(rad/s)", "data", 0.0, None, None),
     )
     others = tuple(GainWithPrior(gain.axis, gain.value, gain.std) for gain in GAINS)
-    full = FullSet("arm.urdf", "a" * 64, 0.1, parameters, others, True, 1.0, 1, 1.0, 0.1, ())
-    return full_parameters.full_parameter_view(replace(CALIBRATION, gains=tuple(GAINS)), full)
+    urdf_sha256 = "a" * 64
+    full = FullSet("arm.urdf", urdf_sha256, 0.1, parameters, others, True, 1.0, 1, 1.0, 0.1, ())
+    calibration = replace(CALIBRATION, gains=tuple(GAINS))
+    return full_parameters.full_parameter_view(calibration, full)
 
 
 def _fleet(cell: Cell, _: Any) -> Iterator[RenderableType]:
-    summary = Summary(GAINS, (("load-friction", AXES[3]),), 3.21, held_out=False, partial=True)
+    effects = (("load-friction", AXES[3]),)
+    summary = Summary(GAINS, effects, 3.21, held_out=False, partial=True)
+    failure = Failure("DataUnfit", "run-17.mcap lost 1234 samples", 4)
     results: tuple[Summary | Failure, ...] = (
         summary,
-        Failure("DataUnfit", "run-17.mcap lost 1234 samples", 4),
+        failure,
     )
     names = ("press-4-in-hall-12-line-7", "gantry-23")
-    return fleet_view(
-        [
-            FleetRow(name, "c" * 64, (), (), one, 1234.56)
-            for name, one in zip(names, results, strict=True)
-        ]
-    )
+    rows = [
+        FleetRow(name, "c" * 64, (), (), one, 1234.56)
+        for name, one in zip(names, results, strict=True)
+    ]
+    return fleet_view(rows)
 
 
 def _changes(cell: Cell, _: Any) -> Iterator[RenderableType]:
@@ -318,9 +362,9 @@ def _changes(cell: Cell, _: Any) -> Iterator[RenderableType]:
 
 
 def _paper(cell: Cell, _: Any) -> Iterator[RenderableType]:
-    return paper_tables.PaperTable(
-        "Table 1", ("parameter", *("10 CAD: value",) * 6), (("zz1", *("1.2345678",) * 6),)
-    ).view()
+    rows = (("zz1", *("1.2345678",) * 6),)
+    headings = ("parameter", *("10 CAD: value",) * 6)
+    return paper_tables.PaperTable("Table 1", headings, rows).view()
 
 
 EXAMPLES: dict[str, Callable[[Cell, Any], Iterable[RenderableType]]] = {
@@ -395,16 +439,15 @@ def _tables(parts: Iterable[RenderableType]) -> Iterator[Table]:
 def test_every_number_of_a_table_is_whole_at_80_columns_and_in_a_pipe(
     name: str, cell: Cell, series: Any
 ) -> None:
-    tables = list(_tables(EXAMPLES[name](cell, series)))
+    parts = EXAMPLES[name](cell, series)
+    tables = list(_tables(parts))
     assert tables
     for table in tables:
         assert isinstance(table, WholeTable)
-        words = [
-            word
-            for column in table.columns
-            for value in (column.header, *column.cells)
-            for word in str(value).split()
-        ]
+        words = []
+        for column in table.columns:
+            for value in (column.header, *column.cells):
+                words.extend(str(value).split())
         for width, terminal in ((80, True), (PIPE_COLUMNS, False)):
             out = io.StringIO()
             console = Console(
@@ -429,15 +472,19 @@ def test_a_row_keeps_its_style_in_every_form() -> None:
         for heading in ("axis", "state", "another"):
             table.add_column(heading, no_wrap=True)
         table.add_row("J1", "x" * 15, "y" * 15, style="bold red")
-        Console(
+        console = Console(
             file=out, width=width, force_terminal=True, color_system="standard", soft_wrap=True
-        ).print(table)
+        )
+        console.print(table)
         assert out.getvalue().count("\x1b[1;31m") >= 2
 
 
 def test_an_error_of_a_fleet_is_below_its_table() -> None:
     text = "run-17.mcap: " + "found words of a long error; " * 10
-    rows = [FleetRow("press-4", "c" * 64, (), (), Failure("DataUnfit", text, 4), 1.0)]
+    result = Failure("DataUnfit", text, 4)
+    configuration_sha256 = "c" * 64
+    fleet_row = FleetRow("press-4", configuration_sha256, (), (), result, 1.0)
+    rows = [fleet_row]
     table, *below = fleet_view(rows)
     assert isinstance(table, WholeTable)
     assert max(len(str(value)) for column in table.columns for value in column.cells) < 40

@@ -57,7 +57,8 @@ def _digits(text: str) -> list[str]:
     st.integers(20, 120),
 )
 def test_every_number_is_whole_at_any_width(rows: list[list[str]], width: int) -> None:
-    table = plain_table([f"heading {number}" for number in range(7)], title="Gains", wrap=(6,))
+    headings = [f"heading {number}" for number in range(7)]
+    table = plain_table(headings, title="Gains", wrap=(6,))
     for row in rows:
         table.add_row(*row)
     text = _shown([table], width)
@@ -81,7 +82,8 @@ SENTENCES = st.lists(WORDS, max_size=30).map(" ".join)
 def test_no_word_of_a_table_is_broken_or_cut_whatever_columns_wrap(
     rows: list[list[str]], wrap: set[int], width: int
 ) -> None:
-    table = plain_table([f"h{number}" for number in range(5)], left=range(5), wrap=wrap)
+    headings = [f"h{number}" for number in range(5)]
+    table = plain_table(headings, left=range(5), wrap=wrap)
     for row in rows:
         table.add_row(*row)
     shown = _on_terminal([table], width)
@@ -102,7 +104,9 @@ def test_columns_share_what_is_free_and_none_gets_more_than_it_wants(
     wanted = [one + extra for one, extra in zip(least, more, strict=False)]
     widths = shared_width(least, wanted, range(len(least)), free)
     assert all(low <= width <= high for low, width, high in zip(least, widths, wanted, strict=True))
-    assert sum(widths) - sum(least) == min(free, sum(wanted) - sum(least))
+    difference = sum(wanted) - sum(least)
+    expected = min(free, difference)
+    assert sum(widths) - sum(least) == expected
 
 
 @given(st.lists(SENTENCES, max_size=4), st.integers(20, 120), st.integers(0, 6))
@@ -124,9 +128,8 @@ def test_a_command_is_not_broken() -> None:
     )
     for line in (f"Next: {command}", command, f"  {command}", "  --yes --base " + "0" * 60):
         assert break_lines(line, 40) == line
-    lines = break_lines(
-        f"word after word comes before `drivegain scan CELL` and {'x ' * 30}", 60
-    ).split("\n")
+    text = f"word after word comes before `drivegain scan CELL` and {'x ' * 30}"
+    lines = break_lines(text, 60).split("\n")
     assert any("`drivegain scan CELL`" in line for line in lines)
 
 
@@ -154,9 +157,8 @@ def test_every_line_of_a_verb_is_broken_between_words_on_a_terminal(
 def test_a_digest_is_on_one_line_of_a_pipe(capsys: pytest.CaptureFixture[str]) -> None:
     assert not sys.stdout.isatty()
     console = output_console()
-    for line in log_lines(
-        {"sha256": SHA256, "a key of many letters and more": "x" * 200}, console.width
-    ):
+    description = {"sha256": SHA256, "a key of many letters and more": "x" * 200}
+    for line in log_lines(description, console.width):
         console.print(line)
     lines = capsys.readouterr().out.splitlines()
     assert any(SHA256 in line for line in lines)

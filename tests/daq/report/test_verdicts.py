@@ -25,16 +25,15 @@ NO_CHANGE = ErrorChange(PairedChange(-1.0, 1.0, 9), (PairedChange(-1.0, 1.0, 9),
 def _judged(judgement: Judgement, *, written: bool) -> EffectVerdict:
     before = RelativeError((3.0, 4.0), 3.5)
     after = RelativeError((3.0, 3.9), 3.4)
-    return EffectVerdict(
-        PlacedEffect(Spring(), 1), judgement, "because", NO_CHANGE, before, after, written=written
-    )
+    placed = PlacedEffect(Spring(), 1)
+    return EffectVerdict(placed, judgement, "because", NO_CHANGE, before, after, written=written)
 
 
 def _said(verdict: EffectVerdict) -> list[str]:
     """The sentences of a fit, of which only the verdicts and the names of the axes count."""
-    fitted = SimpleNamespace(
-        steps=(SimpleNamespace(verdicts=(verdict,)),), cell=SimpleNamespace(place_names=AXES)
-    )
+    steps = (SimpleNamespace(verdicts=(verdict,)),)
+    cell = SimpleNamespace(place_names=AXES)
+    fitted = SimpleNamespace(steps=steps, cell=cell)
     return list(verdict_sentences(cast(Fit, fitted)))
 
 
@@ -54,23 +53,21 @@ def _said(verdict: EffectVerdict) -> list[str]:
 def test_what_is_not_confirmed_is_named_with_both_errors(
     judgement: Judgement, written: bool, words: str
 ) -> None:
-    (sentence,) = _said(_judged(judgement, written=written))
+    verdict = _judged(judgement, written=written)
+    (sentence,) = _said(verdict)
     assert sentence.startswith(words)
 
 
 def test_nothing_is_said_of_a_confirmed_effect_that_is_written() -> None:
-    assert _said(_judged(Judgement.CONFIRMED, written=True)) == []
+    verdict = _judged(Judgement.CONFIRMED, written=True)
+    assert _said(verdict) == []
 
 
 def test_the_document_has_the_verdict() -> None:
-    entry = _verdict(_judged(Judgement.UNDECIDED, written=False), AXES)
-    assert (entry.effect, entry.axis, entry.judgement, entry.written, entry.blocks) == (
-        "spring",
-        "J2",
-        "undecided",
-        False,
-        9,
-    )
+    verdict = _judged(Judgement.UNDECIDED, written=False)
+    entry = _verdict(verdict, AXES)
+    expected = ("spring", "J2", "undecided", False, 9)
+    assert (entry.effect, entry.axis, entry.judgement, entry.written, entry.blocks) == expected
 
 
 @pytest.mark.parametrize(
@@ -79,7 +76,8 @@ def test_the_document_has_the_verdict() -> None:
 def test_the_write_back_refuses_no_effect_for_less_than_a_hundredth(
     after: float, confirmed: bool
 ) -> None:
-    assert AcceptedEffect("spring", "J2", {}, (), 5.76, after).is_confirmed == confirmed
+    accepted_effect = AcceptedEffect("spring", "J2", {}, (), 5.76, after)
+    assert accepted_effect.is_confirmed == confirmed
 
 
 def test_the_options_choose_what_joins() -> None:

@@ -29,7 +29,8 @@ def test_recordings_of_an_earlier_demonstration_are_named_before_they_are_replac
     logs = (tmp_path / "bare-1.mcap", tmp_path / "loaded-1.mcap")
     assert demo.make_room(tmp_path, logs) == ()
     logs[0].touch()
-    assert demo.make_room(tmp_path, logs) == logs[:1]
+    room = demo.make_room(tmp_path, logs)
+    assert room == logs[:1]
     assert not logs[0].exists()
 
 
@@ -43,7 +44,8 @@ def test_an_invalid_run_is_made_again_and_said_so(
     def record(request: RecordingRequest, **_: object) -> Recorded:
         made.append(request)
         request.out.touch(exist_ok=False)
-        log = RunStatistics(10, 0, (0,) * 6, valid=len(made) > spoilt, reason="3 late answers")
+        missing = (0,) * 6
+        log = RunStatistics(10, 0, missing, valid=len(made) > spoilt, reason="3 late answers")
         return Recorded(request.out, log, NOTHING_LOST)
 
     monkeypatch.setattr(demo, "record", record)
@@ -55,18 +57,20 @@ def test_an_invalid_run_is_made_again_and_said_so(
         cell, seed=1, duration_s=6.0, exchanges=0, largest_condition=1e9, largest_std_percent=1e9
     )
     for name in demo.PLANS:
-        save_plan(replace(moves, moves=moves.moves[:1]), tmp_path / f"plan-{name}.yaml")
+        changed_move = replace(moves, moves=moves.moves[:1])
+        path = tmp_path / f"plan-{name}.yaml"
+        save_plan(changed_move, path)
     settings = Settings(tmp_path, shipped_simulation(), 1, 10.0)
-    stages = DemoStages(
-        settings, cell, lambda: BEGAN, ProgressReporter(steps.append, lambda *_: None)
-    )
+    reporter = ProgressReporter(steps.append, lambda *_: None)
+    stages = DemoStages(settings, cell, lambda: BEGAN, reporter)
     if spoilt > RETRIES:
         with pytest.raises(RunInvalid, match="3 late answers"):
             stages.run(cell_file)
         assert issubclass(RunInvalid, DataError)  # as a fit of that run would end
     else:
         stages.run(cell_file)
-        assert [request.out.stem for request in made[spoilt:]] == [name for name, _, _ in demo.RUNS]
+        expected = [name for name, _, _ in demo.RUNS]
+        assert [request.out.stem for request in made[spoilt:]] == expected
         assert all(stages.recorded[name].log.valid for name, _, _ in demo.RUNS)
     assert [step for step in steps if "again" in step] == [
         f"record bare-1 again ({attempt} of at most {RETRIES} times): 3 late answers"

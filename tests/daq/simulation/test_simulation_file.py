@@ -21,8 +21,10 @@ def test_the_truth_is_read(checkout: Path) -> None:
     assert spec.payload is not None
     assert spec.payload.mass_kg == 4.59
     assert (spec.effects[0].name, spec.effects[0].axis) == ("load-friction", 2)
-    np.testing.assert_allclose(spec.start_rad, [0, 0, np.pi / 2, 0, 0, 0])
-    assert spec.axes[3].gain_nm_per_a == -9.21
+    expected = [0, 0, np.pi / 2, 0, 0, 0]
+    np.testing.assert_allclose(spec.start_rad, expected)
+    gain_nm_per_a = spec.axes[3].gain_nm_per_a
+    assert gain_nm_per_a == -9.21
     assert "<robot" in spec.urdf
     assert load_simulation(path).payload is None
 
@@ -109,15 +111,18 @@ def test_a_wrong_file_is_refused(
     text = (checkout / "configs/simulation/demo.yaml").read_text(encoding="utf-8")
     assert old in text
     path = tmp_path / "spoiled.yaml"
-    path.write_text(text.replace(old, new, 1), encoding="utf-8")
+    changed_text = text.replace(old, new, 1)
+    path.write_text(changed_text, encoding="utf-8")
     with pytest.raises(kind, match=message):
         load_simulation(path)
 
 
 def test_a_closed_chain_is_read(checkout: Path) -> None:
-    spec = load_simulation(checkout / "configs/simulation/orthoglide.yaml", "spindle")
+    path = checkout / "configs/simulation/orthoglide.yaml"
+    spec = load_simulation(path, "spindle")
     assert spec.motors == ("slide-x", "slide-y", "slide-z")
-    assert spec.closures[3].directions == ("x", "y", "z", "rx", "ry")
+    expected = ("x", "y", "z", "rx", "ry")
+    assert spec.closures[3].directions == expected
     assert spec.platform == "plate-centre"
     assert spec.passive["swing-x"].viscous_nm_s_rad == 0.01
     assert len(spec.assembly_rad) == 16
@@ -178,8 +183,10 @@ def test_a_wrong_closed_chain_is_refused(
     text = (folder / "five-bar.yaml").read_text(encoding="utf-8")
     assert old in text
     path = tmp_path / "spoiled.yaml"
-    path.write_text(text.replace(old, new, 1), encoding="utf-8")
-    (tmp_path / "five-bar-plant.urdf").write_bytes((folder / "five-bar-plant.urdf").read_bytes())
+    changed_text = text.replace(old, new, 1)
+    path.write_text(changed_text, encoding="utf-8")
+    content = (folder / "five-bar-plant.urdf").read_bytes()
+    (tmp_path / "five-bar-plant.urdf").write_bytes(content)
     with pytest.raises(kind, match=message):
         load_simulation(path)
 
@@ -187,9 +194,11 @@ def test_a_wrong_closed_chain_is_refused(
 def test_a_serial_robot_has_no_key_of_a_closed_chain(checkout: Path, tmp_path: Path) -> None:
     folder = checkout / "configs/simulation"
     path = tmp_path / "gantry.yaml"
-    (tmp_path / "gantry-plant.urdf").write_bytes((folder / "gantry-plant.urdf").read_bytes())
+    content = (folder / "gantry-plant.urdf").read_bytes()
+    (tmp_path / "gantry-plant.urdf").write_bytes(content)
+    text = (folder / "gantry.yaml").read_text(encoding="utf-8")
     path.write_text(
-        (folder / "gantry.yaml").read_text(encoding="utf-8") + "motors: [X, Y, Z, A, B]\n",
+        text + "motors: [X, Y, Z, A, B]\n",
         encoding="utf-8",
     )
     with pytest.raises(ConfigurationInconsistent, match="without closures"):
@@ -205,11 +214,14 @@ def test_a_joint_that_follows_another_is_refused_and_not_simulated_as_a_free_one
     found = re.search(r"(?m)^urdf: *(\S+)", text)
     assert found is not None
     urdf = (folder / found[1]).read_text()
-    first, last = re.findall(r'<joint name="([^"]+)" type="(?!fixed)', urdf)[::2][:2]
+    matches = re.findall(r'<joint name="([^"]+)" type="(?!fixed)', urdf)
+    first, last = matches[::2][:2]
     head, joint, tail = urdf.partition(f'<joint name="{last}"')
     mimic = f'<mimic joint="{first}" multiplier="0.5"/></joint>'
-    (tmp_path / "mimic.urdf").write_text(head + joint + tail.replace("</joint>", mimic, 1))
-    (tmp_path / "cell.yaml").write_text(text.replace(found[1], "mimic.urdf"))
+    changed_tail = tail.replace("</joint>", mimic, 1)
+    (tmp_path / "mimic.urdf").write_text(head + joint + changed_tail)
+    changed_text = text.replace(found[1], "mimic.urdf")
+    (tmp_path / "cell.yaml").write_text(changed_text)
     with pytest.raises(ConfigurationInconsistent) as caught:
         load_simulation(tmp_path / "cell.yaml")
     assert f"joint {last} with <mimic> of {first}" in caught.value.found
@@ -220,7 +232,8 @@ def test_only_simulate_and_demo_import_the_truth(checkout: Path) -> None:
     importers = set()
     for room in ("daq", "ident", "drivers"):
         for path in (checkout / room).rglob("*.py"):
-            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            text = path.read_text(encoding="utf-8")
+            for node in ast.walk(ast.parse(text)):
                 if isinstance(node, ast.Import):
                     names = [a.name for a in node.names]
                 else:

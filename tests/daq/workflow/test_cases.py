@@ -80,8 +80,9 @@ def shelf() -> Shelf:
     truth = tx40_truth()
     rng = np.random.default_rng(5)
     drawn = {name: value for name, value in PAYLOAD_TRUTH.items() if name != "m"}
+    path = shipped_configurations() / "cells" / "demo.yaml"
     cell = replace(
-        load_cell(shipped_configurations() / "cells" / "demo.yaml"),
+        load_cell(path),
         payloads=(
             WeighedPayload("disc", "a", 4.59, 0.005, drawn),
             WeighedPayload("plate", "z", 4.5, 0.005, {}),
@@ -112,7 +113,8 @@ def reduced(shelf: Shelf) -> ReducedLogs:
     """Read once for all cases."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(fit_module, "load_run", shelf.load)
-        return reduce_logs(_paths("bare1", "disc1", "bare2", "disc2"), _paths("disc3"))
+        logs = _paths("bare1", "disc1", "bare2", "disc2")
+        return reduce_logs(logs, _paths("disc3"))
 
 
 @pytest.fixture(scope="module")
@@ -138,11 +140,13 @@ def _paths(*names: str) -> list[Path]:
 
 
 def _error(calibration: Calibration) -> float:
-    return float(np.max(np.abs(np.array([gain.value for gain in calibration.gains]) / GAINS - 1.0)))
+    gains = np.array([gain.value for gain in calibration.gains])
+    return float(np.max(np.abs(gains / GAINS - 1.0)))
 
 
 def test_every_case_is_what_it_says(calibrations: dict[str, Calibration]) -> None:
-    nameplate = [gain.nameplate for gain in calibrations["ml"].gains]
+    gains = calibrations["ml"].gains
+    nameplate = [gain.nameplate for gain in gains]
     assert [gain.value for gain in calibrations["manufacturer"].gains] == nameplate
     for name, own in {
         "manufacturer": 10,
@@ -152,12 +156,13 @@ def test_every_case_is_what_it_says(calibrations: dict[str, Calibration]) -> Non
         "case-4": 9,
         "ml": 9,
     }.items():
-        of_payload = [
-            parameter for parameter in calibrations[name].parameters if ":" in parameter.name
-        ]
+        parameters = calibrations[name].parameters
+        of_payload = [parameter for parameter in parameters if ":" in parameter.name]
         assert sum(parameter.std > 0.0 for parameter in of_payload) == own
-        assert {parameter.name for parameter in of_payload} == {f"{p}:a" for p in LINK_PARAMETERS}
-    assert [calibrations[f"case-{n}"].method for n in (1, 2, 3, 4)] == ["wls", "wls", "tls", "tls"]
+        expected = {f"{p}:a" for p in LINK_PARAMETERS}
+        assert {parameter.name for parameter in of_payload} == expected
+    methods = [calibrations[f"case-{n}"].method for n in (1, 2, 3, 4)]
+    assert methods == ["wls", "wls", "tls", "tls"]
 
 
 def test_a_right_drawing_helps_wls_and_ml_needs_none(calibrations: dict[str, Calibration]) -> None:
@@ -171,7 +176,8 @@ def test_a_right_drawing_helps_wls_and_ml_needs_none(calibrations: dict[str, Cal
 def test_a_wrong_drawing_spoils_what_relies_on_it(reduced: ReducedLogs) -> None:
     disc, plate = reduced.cell.payloads
     wrong = replace(disc, known={name: 1.1 * value for name, value in disc.known.items()})
-    spoilt = replace(reduced, cell=replace(reduced.cell, payloads=(wrong, plate)))
+    cell = replace(reduced.cell, payloads=(wrong, plate))
+    spoilt = replace(reduced, cell=cell)
     found = [
         calibration_of_case(fit_case(logs, Method.ML, known), CREATED)
         for logs, known in ((reduced, Known.CAD), (spoilt, Known.CAD), (spoilt, Known.MASS))
@@ -197,23 +203,27 @@ def test_one_reading_gives_what_fit_gives(reduced: ReducedLogs) -> None:
 def test_essential_parameters_leave_no_trace_in_the_file(
     reduced: ReducedLogs, tmp_path: Path
 ) -> None:
-    found = essential_fit(fit_case(reduced, Method.WLS, Known.MASS).fitted, 20.0)
+    fitted = fit_case(reduced, Method.WLS, Known.MASS).fitted
+    found = essential_fit(fitted, 20.0)
     calibration = calibration_of_case(found, CREATED)
     assert found.essential is not None
     removed = {step.name for step in found.essential.removed}
     assert len(removed) > 5
     assert not removed & {parameter.name for parameter in calibration.parameters}
     save_calibration(calibration, tmp_path / "c.yaml")
-    assert load_calibration(tmp_path / "c.yaml") == calibration
+    path = tmp_path / "c.yaml"
+    assert load_calibration(path) == calibration
     error = calibration.holdout_error_percent
     assert error is not None
-    found_again = cross_validate({"c": calibration}, _paths("disc3")).runs[0].errors["c"]
+    runs = cross_validate({"c": calibration}, _paths("disc3")).runs
+    found_again = runs[0].errors["c"]
     assert found_again.axes == pytest.approx(error.axes, rel=1e-6)
 
 
 def test_a_run_held_out_must_carry_what_the_fit_has_met() -> None:
+    logs = _paths("bare1", "disc1")
     with pytest.raises(DataUnfit, match="'b', which no run of the fit carries"):
-        reduce_logs(_paths("bare1", "disc1"), _paths("plate1"))
+        reduce_logs(logs, _paths("plate1"))
 
 
 @pytest.fixture(scope="module")
@@ -221,7 +231,8 @@ def found(shelf: Shelf, calibrations: dict[str, Calibration]) -> CrossValidation
     """All cases on runs of all three kinds."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(validate_module, "load_run", shelf.load)
-        return cross_validate(calibrations, _paths("disc2", "bare3", "disc3", "plate1", "plate2"))
+        logs = _paths("disc2", "bare3", "disc3", "plate1", "plate2")
+        return cross_validate(calibrations, logs)
 
 
 def test_cross_validation_distinguishes_good_gains_from_bad(found: CrossValidation) -> None:
@@ -253,7 +264,8 @@ def test_cross_validation_distinguishes_good_gains_from_bad(found: CrossValidati
 
 def test_what_was_seen_and_what_cannot_be_predicted_is_said(found: CrossValidation) -> None:
     runs = {run.run: run for run in found.runs}
-    assert runs["disc2"].seen_by == tuple(found.calibrations)
+    seen_by = runs["disc2"].seen_by
+    assert seen_by == tuple(found.calibrations)
     assert runs["disc3"].seen_by == ()
     assert runs["plate1"].errors == {}
     assert "leaves its mass open" in runs["plate1"].left_out
@@ -264,9 +276,8 @@ def test_what_was_seen_and_what_cannot_be_predicted_is_said(found: CrossValidati
 def test_without_bare_runs_the_calibrations_robot_serves(
     calibrations: dict[str, Calibration],
 ) -> None:
-    found = cross_validate(
-        {"ml": calibrations["ml"], "case-2": calibrations["case-2"]}, _paths("disc3", "plate1")
-    )
+    logs = _paths("disc3", "plate1")
+    found = cross_validate({"ml": calibrations["ml"], "case-2": calibrations["case-2"]}, logs)
     assert not found.with_bare_runs
     for run in found.weighed:
         # No robot was identified with the nameplate gains
@@ -282,18 +293,21 @@ def test_without_bare_runs_the_calibrations_robot_serves(
 def test_an_unknown_mounting_is_weighed_and_not_predicted(
     shelf: Shelf, calibrations: dict[str, Calibration]
 ) -> None:
-    elsewhere = replace(shelf.runs["disc3"], payload=replace(MOUNTED, mounting="c"))
+    payload = replace(MOUNTED, mounting="c")
+    elsewhere = replace(shelf.runs["disc3"], payload=payload)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(validate_module, "load_run", lambda *_: (elsewhere, shelf.cell))
         found = cross_validate({"ml": calibrations["ml"]}, _paths("x"))
     assert "nothing is known of mounting 'c'" in found.runs[0].left_out
-    assert isinstance(found.weighed[0].masses["ml"], Mass)
+    masses = found.weighed[0].masses
+    assert isinstance(masses["ml"], Mass)
 
 
 def test_another_weight_in_the_same_mounting_is_refused(
     shelf: Shelf, calibrations: dict[str, Calibration]
 ) -> None:
-    other = replace(shelf.runs["disc3"], payload=replace(MOUNTED, known={"m": 2.0}))
+    payload = replace(MOUNTED, known={"m": 2.0})
+    other = replace(shelf.runs["disc3"], payload=payload)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(validate_module, "load_run", lambda *_: (other, shelf.cell))
         with pytest.raises(DataUnfit, match=r"carries 2 kg .* has 4\.59 kg"):
@@ -303,9 +317,8 @@ def test_another_weight_in_the_same_mounting_is_refused(
 def test_a_run_too_short_to_weigh_says_why(
     shelf: Shelf, calibrations: dict[str, Calibration]
 ) -> None:
-    short = record(
-        tx40_truth(), "short", np.random.default_rng(1), MOUNTED, seconds=4.0, noise_a=0.1
-    )
+    rng = np.random.default_rng(1)
+    short = record(tx40_truth(), "short", rng, MOUNTED, seconds=4.0, noise_a=0.1)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(validate_module, "load_run", lambda *_: (short, shelf.cell))
         found = cross_validate({"ml": calibrations["ml"]}, _paths("short"))
@@ -333,16 +346,20 @@ def test_the_tables_have_the_papers_form(
     assert rows["‖ρ‖/‖Y‖"][1].endswith(" %")
     gains = paper_gain_table(4, calibrations["case-3"], calibrations["case-4"], "IDIM-TLS")
     assert [row[:2] for row in gains.rows[:2]] == [("J1", "32.96"), ("J2", "32.96")]
-    expected = np.mean([abs(gain.change_percent) for gain in calibrations["case-4"].gains])
-    assert float(gains.rows[-1][-1]) == pytest.approx(expected, abs=0.006)
-    assert len(condition_table(found).headings) == 1 + 5
+    absolute_change_percent = [abs(gain.change_percent) for gain in calibrations["case-4"].gains]
+    expected = np.mean(absolute_change_percent)
+    last_row = gains.rows[-1]
+    assert float(last_row[-1]) == pytest.approx(expected, abs=0.006)
+    headings = condition_table(found).headings
+    assert len(headings) == 1 + 5
     errors = paper_error_table(found)
     assert len(errors.rows) == 3 * 6 + 1
     of_ml = [run.errors["ml"].axes for run in found.runs if run.errors]
     assert float(errors.rows[-1][errors.headings.index("ml")]) == pytest.approx(
         np.mean(of_ml), abs=0.006
     )
-    assert [table.number for table in mass_tables(found)] == [7, 8]
+    numbers = [table.number for table in mass_tables(found)]
+    assert numbers == [7, 8]
     for table in (one, gains, condition_table(found), errors, *mass_tables(found)):
         assert all(len(row) == len(table.headings) for row in table.rows)
         assert table.markdown().count("\n| ") == len(table.rows) + 2
@@ -353,24 +370,27 @@ def test_the_command_line_writes_cases_and_tables(
 ) -> None:
     folder, printed = written
     logs = ["bare1", "disc1", "bare2", "disc2"]
-    assert set(printed["cases"]) == {case.name for case in CASES}
+    expected = {case.name for case in CASES}
+    assert set(printed["cases"]) == expected
     assert printed["cases"]["case-2"]["removed"]
     assert sorted(path.name for path in folder.iterdir()) == sorted(
         [*(f"{case.name}.yaml" for case in CASES), "tables.md"]
     )
     page = (folder / "tables.md").read_text(encoding="utf-8")
-    assert [line[3:10] for line in page.splitlines() if line.startswith("## ")] == [
-        f"Table {n}" for n in (1, 2, 3, 4)
-    ]
+    lines = [line[3:10] for line in page.splitlines() if line.startswith("## ")]
+    assert lines == [f"Table {n}" for n in (1, 2, 3, 4)]
     out = tmp_path / "validation"
     ml = str(folder / "ml.yaml")
     runs = ["bare3", "disc3", "plate1"]
     assert main(["validate", ml, *runs, "--beside", str(folder), "--out", str(out), "--json"]) == 0
     checked = json.loads(capsys.readouterr().out)
     assert checked["calibrations"] == ["ml", "case-1", "case-2", "case-3", "case-4", "manufacturer"]
-    assert checked["logs"][0]["log"] == "bare3"
-    assert checked["runs"][2]["relative_error_percent"] == {}
-    assert checked["payloads"][0]["masses"]["ml"]["error_percent"] < 1.0
+    first_log = checked["logs"][0]
+    assert first_log["log"] == "bare3"
+    relative_error_percent = checked["runs"][2]["relative_error_percent"]
+    assert relative_error_percent == {}
+    masses = checked["payloads"][0]["masses"]
+    assert masses["ml"]["error_percent"] < 1.0
     page = (out / "tables.md").read_text(encoding="utf-8")
     assert [line[3:10] for line in page.splitlines() if line.startswith("## ")] == [
         f"Table {n}" for n in (5, 6, 7, 8)
@@ -382,9 +402,11 @@ def test_the_command_line_writes_cases_and_tables(
     assert "leaves its mass open" in text
     case_3 = ("--known", "cad", "--method", "tls", "--essential", "20")
     assert main(["fit", *logs, *case_3, "--json"]) == 0
-    gains = [gain["value"] for gain in json.loads(capsys.readouterr().out)["gains"]]
+    document = json.loads(capsys.readouterr().out)
+    gains = [gain["value"] for gain in document["gains"]]
+    case_3_path = folder / "case-3.yaml"
     assert gains == pytest.approx(
-        [gain.value for gain in load_calibration(folder / "case-3.yaml").gains], rel=1e-6
+        [gain.value for gain in load_calibration(case_3_path).gains], rel=1e-6
     )
 
 

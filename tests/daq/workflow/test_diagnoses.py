@@ -50,7 +50,8 @@ def recorded() -> Shelf:
         run = record(
             truth, name, rng, MOUNTED if mounted else None, noise_a=0.1, seconds=12.0, rate_hz=200.0
         )
-        return replace(run, digest=name.encode().hex().ljust(64, "0"))
+        digest = name.encode().hex().ljust(64, "0")
+        return replace(run, digest=digest)
 
     loaded = made("crossed", mounted=True)
     runs = [
@@ -61,7 +62,8 @@ def recorded() -> Shelf:
         replace(loaded, name="thousandfold", current_a=1000.0 * loaded.current_a),
         replace(loaded, name="good"),
     ]
-    cell = load_cell(shipped_configurations() / "cells" / "demo.yaml")
+    path = shipped_configurations() / "cells" / "demo.yaml"
+    cell = load_cell(path)
     return Shelf(cell, {run.name: run for run in runs})
 
 
@@ -74,7 +76,9 @@ def calibration(recorded: Shelf) -> Calibration:
 
 def test_nothing_is_said_of_good_recordings(shelf: Shelf, calibration: Calibration) -> None:
     assert calibration.diagnoses == ()
-    assert cross_validate({"one": calibration}, [*FIT, Path("good")]).diagnoses == ()
+    logs = [*FIT, Path("good")]
+    diagnoses = cross_validate({"one": calibration}, logs).diagnoses
+    assert diagnoses == ()
 
 
 @pytest.mark.parametrize(
@@ -88,22 +92,28 @@ def test_nothing_is_said_of_good_recordings(shelf: Shelf, calibration: Calibrati
 def test_validate_names_the_log(
     shelf: Shelf, calibration: Calibration, log: str, name: str, axes: tuple[str, ...]
 ) -> None:
-    found = cross_validate({"one": calibration}, [Path(log)])
+    logs = [Path(log)]
+    found = cross_validate({"one": calibration}, logs)
     assert {one.name for one in found.diagnoses} == {name}
-    assert (found.diagnoses[0].runs, found.diagnoses[0].axes) == ((log,), axes)
-    assert validate_report(calibration, found, {}).diagnoses[0].name == name
+    runs = found.diagnoses[0].runs
+    assert (runs, found.diagnoses[0].axes) == ((log,), axes)
+    diagnoses = validate_report(calibration, found, {}).diagnoses
+    assert diagnoses[0].name == name
 
 
 def test_a_diagnosis_that_is_made_again_is_shown_once(
     shelf: Shelf, calibration: Calibration
 ) -> None:
-    fresh = cross_validate({"one": calibration}, [Path("thousandfold")]).diagnoses
+    logs = [Path("thousandfold")]
+    fresh = cross_validate({"one": calibration}, logs).diagnoses
     other = replace(fresh[0], runs=("another",))
-    stored = replace(calibration, diagnoses=(*fresh, other))
+    diagnoses = (*fresh, other)
+    stored = replace(calibration, diagnoses=diagnoses)
     found = cross_validate({"one": stored}, [Path("thousandfold")])
     assert found.diagnoses == (*fresh, other)
     checks = [str(one) for one in validation_view(stored, found) if "CHECK " in str(one)]
-    assert len(checks) == len(fresh) + 1
+    expected = len(fresh) + 1
+    assert len(checks) == expected
     assert all(check.startswith("CHECK thousandfold, ") for check in checks[:-1])
     assert checks[-1].startswith("The fit of this calibration found: CHECK another, ")
 
@@ -127,26 +137,27 @@ def test_the_operator_may_say_that_no_currents_are_exchanged(shelf: Shelf) -> No
     logs = [*FIT, Path("crossed")]
     with pytest.raises(ChannelsExchanged, match="--channels-as-wired"):
         fit(logs)
-    assert {one.name for one in fit(logs, channels_as_wired=True).diagnoses} >= {"axis-error"}
+    diagnoses = fit(logs, channels_as_wired=True).diagnoses
+    assert {one.name for one in diagnoses} >= {"axis-error"}
 
 
 @pytest.mark.parametrize("fixed", [False, True])
 def test_exchanged_currents_in_one_log_of_the_fit_name_it(shelf: Shelf, fixed: bool) -> None:
+    logs = [*FIT, Path("crossed")]
     with pytest.raises(ChannelsExchanged, match="log crossed: the currents of J2 and J3"):
-        fit([*FIT, Path("crossed")], gains_fixed=fixed)
+        fit(logs, gains_fixed=fixed)
 
 
 def test_exchanged_currents_in_a_held_out_run_are_named(shelf: Shelf) -> None:
-    first = fit(FIT, holdout=[Path("crossed")]).diagnoses[0]
-    assert (first.name, first.runs, first.axes) == (
-        "channels-exchanged",
-        ("crossed",),
-        ("J2", "J3"),
-    )
+    holdout = [Path("crossed")]
+    first = fit(FIT, holdout=holdout).diagnoses[0]
+    expected = ("channels-exchanged", ("crossed",), ("J2", "J3"))
+    assert (first.name, first.runs, first.axes) == expected
 
 
 def test_a_calibration_keeps_what_was_said_of_its_fit(shelf: Shelf) -> None:
-    made = calibration_of(fit(FIT, method=Method.WLS), WHEN)
+    fitted = fit(FIT, method=Method.WLS)
+    made = calibration_of(fitted, WHEN)
     assert {one.name for one in made.diagnoses} == {"estimators-disagree"}
     assert (
         decode_calibration(encode_calibration(made), "calibration.yaml").diagnoses == made.diagnoses

@@ -56,7 +56,8 @@ class Exported:
     def missing_nm(self) -> FloatArray:
         """Torque that the document says the model lacks, shape (m, k)."""
         value_of = {entry["name"]: entry["value"] for entry in self.report["not_in_mjcf"]}
-        values = np.array([value_of.get(column.name, 0.0) for column in self.robot.model.columns])
+        columns = self.robot.model.columns
+        values = np.array([value_of.get(column.name, 0.0) for column in columns])
         return np.asarray(
             np.einsum("jck,c->jk", self.robot.model.regressor(self.robot.states), values)
         )
@@ -74,7 +75,8 @@ def export(
     assert (
         main(["export", "mjcf", str(robot.cell_file), str(file), "--out", str(out), "--json"]) == 0
     )
-    return Exported(robot, out.read_text(), json.loads(capsys.readouterr().out))
+    report = json.loads(capsys.readouterr().out)
+    return Exported(robot, out.read_text(), report)
 
 
 def loaded(text: str) -> Any:
@@ -98,7 +100,8 @@ def inverse_nm(text: str, robot: CalibratedRobot, *, friction: bool = True) -> F
         simulated.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_FRICTIONLOSS
     data = mujoco.MjData(simulated)
     followed = robot.model.follow(robot.states)
-    dofs = [simulated.joint(joint.name).dofadr[0] for joint in robot.model.robot.joints]
+    joints = robot.model.robot.joints
+    dofs = [simulated.joint(joint.name).dofadr[0] for joint in joints]
     torques = []
     tree = followed.joints
     for position, velocity, acceleration in zip(
@@ -119,7 +122,8 @@ def is_moving(robot: CalibratedRobot) -> NDArray[np.bool_]:
     motors = velocity @ robot.model.drive_train.direction.T
     joints = robot.model.follow(robot.states).joints.velocity_rad_s
     moving = [np.abs(speeds) > SLOWEST for speeds in (velocity, motors, joints)]
-    return np.asarray(np.concatenate(moving, axis=1).all(axis=1))
+    stacked_moving = np.concatenate(moving, axis=1)
+    return np.asarray(stacked_moving.all(axis=1))
 
 
 def dry_nm(robot: CalibratedRobot) -> FloatArray:
@@ -140,7 +144,8 @@ def test_inverse_dynamics_are_the_predicted_torque_without_what_is_listed(
     assert exported.report["exact"]
     assert exported.report["same_configuration"]
     assert exported.report["closures_left_out"] == []
-    axes = [joint + 1 for joint in robot.model.robot.axis_joints]
+    axis_joints = robot.model.robot.axis_joints
+    axes = [joint + 1 for joint in axis_joints]
     assert [entry["name"] for entry in exported.report["not_in_mjcf"]] == [
         f"off{number}" for number in axes
     ]
@@ -196,7 +201,8 @@ def _turn_frame(root: Element) -> None:
 
 def _drop(name: str, attribute: str) -> Any:
     def change(root: Element) -> None:
-        _found(root, f".//*[@name='{name}'][@{attribute}]").set(attribute, "0")
+        path = f".//*[@name='{name}'][@{attribute}]"
+        _found(root, path).set(attribute, "0")
 
     return change
 
@@ -235,7 +241,8 @@ def test_one_wrong_number_is_another_torque(
     root = fromstring(exported.text)
     change(root)
     moving = is_moving(robot)
-    found = inverse_nm(tostring(root, encoding="unicode"), robot) + exported.missing_nm
+    text = tostring(root, encoding="unicode")
+    found = inverse_nm(text, robot) + exported.missing_nm
     assert apart(found[:, moving], robot.predicted_nm()[:, moving]) > 100 * SAME
 
 
@@ -247,11 +254,14 @@ def test_the_actuators_turn_currents_into_torques_by_the_identified_gains(
     exported = export(robot, tmp_path, capsys)
     simulated = loaded(exported.text)
     data = mujoco.MjData(simulated)
-    current_a = np.random.default_rng(8).uniform(-5.0, 5.0, (1, robot.model.robot.axis_count))
+    rng = np.random.default_rng(8)
+    axis_count = robot.model.robot.axis_count
+    current_a = rng.uniform(-5.0, 5.0, (1, axis_count))
     for axis, value in zip(robot.cell.axis_names, current_a[0], strict=True):
         data.actuator(axis).ctrl = value
     mujoco.mj_forward(simulated, data)
-    dofs = [simulated.joint(joint.name).dofadr[0] for joint in robot.model.robot.axes]
+    axes = robot.model.robot.axes
+    dofs = [simulated.joint(joint.name).dofadr[0] for joint in axes]
     expected = measured_torque(robot.calibration, robot.model, current_a)[0]
     assert data.qfrc_actuator[dofs] == pytest.approx(expected, rel=1e-9)
     for entry, gain in zip(exported.report["actuators"], robot.calibration.gains, strict=True):
@@ -268,7 +278,8 @@ def test_predicted_currents_accelerate_the_simulated_robot_as_predicted(
     data = mujoco.MjData(simulated)
     torque_nm = robot.predicted_nm() - exported.missing_nm
     gains = np.array([gain.value for gain in robot.calibration.gains])
-    current_a = (robot.model.drive_train.to_motor @ torque_nm).T / gains
+    to_motor = robot.model.drive_train.to_motor
+    current_a = (to_motor @ torque_nm).T / gains
     largest = np.abs(robot.states.acceleration_rad_s2).max()
     moving = np.flatnonzero(is_moving(robot))
     for sample in moving[:40]:
@@ -290,17 +301,20 @@ def _simulated_gap_m(simulated: Any, robot: CalibratedRobot) -> tuple[float, flo
     mujoco.mj_resetDataKeyframe(simulated, data, 0)
     start = data.qpos.copy()
     push_nm = 0.06 * float(np.abs(robot.predicted_nm()).max())
-    data.ctrl[0] = push_nm / robot.calibration.gains[0].value
+    gain = robot.calibration.gains[0].value
+    data.ctrl[0] = push_nm / gain
     for _ in range(300):
         mujoco.mj_step(simulated, data)
     assert not any(warning.number for warning in data.warning)
     joints = [simulated.joint(joint.name).qposadr[0] for joint in robot.model.robot.joints]
-    placed = poses(robot.model.robot, data.qpos[joints][None])
-    gaps = [
-        origin(placed, closure.first) - origin(placed, closure.second)
-        for closure in robot.model.robot.closures
-    ]
-    return float(np.abs(data.qpos - start).max()), float(np.abs(gaps).max())
+    position_rad = data.qpos[joints][None]
+    placed = poses(robot.model.robot, position_rad)
+    closures = robot.model.robot.closures
+    gaps = [origin(placed, closure.first) - origin(placed, closure.second) for closure in closures]
+    qpos_difference = data.qpos - start
+    largest_qpos_difference = np.abs(qpos_difference).max()
+    largest_absolute_gap = np.abs(gaps).max()
+    return float(largest_qpos_difference), float(largest_absolute_gap)
 
 
 @pytest.mark.parametrize("name", CLOSED)
@@ -308,10 +322,12 @@ def test_a_simulated_closed_chain_stays_closed(
     name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     robot = robot_of(name)
-    simulated = loaded(export(robot, tmp_path, capsys).text)
+    text = export(robot, tmp_path, capsys).text
+    simulated = loaded(text)
     moved, gap_m = _simulated_gap_m(simulated, robot)
     assert moved > 0.01
-    assert gap_m < 1e-3 * robot.model.assembly.size_m
+    size_m = robot.model.assembly.size_m
+    assert gap_m < 1e-3 * size_m
     simulated.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_EQUALITY
     _, apart_m = _simulated_gap_m(simulated, robot)
     assert apart_m > 10.0 * gap_m
@@ -330,7 +346,8 @@ def test_a_joint_that_follows_an_axis_follows_it_in_mujoco(
       <axis xyz="0 1 0"/><limit lower="-9" upper="9" velocity="1" effort="1"/>
       <mimic joint="J5" multiplier="-0.5" offset="0.1"/></joint></robot>"""
     urdf = (source / "robots/tx40.urdf").read_text()
-    (tmp_path / "robots/tx40.urdf").write_text(urdf.replace("</robot>", rod))
+    changed_urdf = urdf.replace("</robot>", rod)
+    (tmp_path / "robots/tx40.urdf").write_text(changed_urdf)
     cell = tmp_path / "cells/tx40.yaml"
     cell.write_text((source / "cells/tx40.yaml").read_text())
     robot = calibrated_robot(cell)
@@ -344,10 +361,13 @@ def test_a_joint_that_follows_an_axis_follows_it_in_mujoco(
     leader = simulated.joint("J5").qposadr[0]
     follower = simulated.joint("rod").qposadr[0]
     start = data.qpos[leader]
-    data.ctrl[4] = 3.0 * np.sign(robot.calibration.gains[4].value)  # that of J5, in A
+    gain = robot.calibration.gains[4].value
+    gain_sign = np.sign(gain)
+    data.ctrl[4] = 3.0 * gain_sign  # that of J5, in A
     for _ in range(200):
         mujoco.mj_step(simulated, data)
-    assert abs(data.qpos[leader] - start) > 0.02
+    qpos_difference = data.qpos[leader] - start
+    assert abs(qpos_difference) > 0.02
     assert data.qpos[follower] == pytest.approx(0.1 - 0.5 * data.qpos[leader], abs=2e-3)
 
 
@@ -362,7 +382,8 @@ def test_a_planar_loop_closes_beside_its_plane(
     tip = re.search(r'<joint name="tip-2" type="fixed">\s*<origin xyz="(\S+) (\S+) (\S+)"', urdf)
     assert tip is not None
     raised = tip[0].replace(f'{tip[2]} {tip[3]}"', f'{tip[2]} {float(tip[3]) + 0.03:g}"')
-    (tmp_path / "robots/five-bar.urdf").write_text(urdf.replace(tip[0], raised))
+    changed_urdf = urdf.replace(tip[0], raised)
+    (tmp_path / "robots/five-bar.urdf").write_text(changed_urdf)
     cell = tmp_path / "cells/five-bar.yaml"
     cell.write_text((source / "cells/five-bar.yaml").read_text())
     exported = export(calibrated_robot(cell), tmp_path, capsys)
@@ -371,7 +392,8 @@ def test_a_planar_loop_closes_beside_its_plane(
     data = mujoco.MjData(simulated)
     mujoco.mj_resetDataKeyframe(simulated, data, 0)
     mujoco.mj_forward(simulated, data)
-    assert np.abs(data.efc_pos[: data.ne]).max() < 1e-9
+    absolute_efc_pos = np.abs(data.efc_pos[: data.ne])
+    assert absolute_efc_pos.max() < 1e-9
     assert data.ne == 3
 
 
@@ -382,9 +404,11 @@ def test_effects_are_listed_and_exactly_they_are_missing(
     coefficient = Parameter("load-friction coefficient 3 (speed_exponent 0)", 0.1, 0.01, "1")
     effect = AcceptedEffect("load-friction", "J3", {"speed_exponent": 0}, (coefficient,), 6.1, 3.4)
     calibration = robot.with_effect(effect)
+    parameter = Parameter("mx:flange-a", 0.3, 0.01, "kg m")
+    parameters = (*calibration.parameters, parameter)
     calibration = replace(
         calibration,
-        parameters=(*calibration.parameters, Parameter("mx:flange-a", 0.3, 0.01, "kg m")),
+        parameters=parameters,
     )
     exported = export(robot, tmp_path, capsys, calibration)
     assert exported.report["effects_left_out"] == ["load-friction on J3"]
@@ -394,7 +418,8 @@ def test_effects_are_listed_and_exactly_they_are_missing(
     assert listed["axis"] == "J3"
     assert listed["package"] is None
     assert listed["settings"] == {"speed_exponent": 0}
-    assert listed["coefficients"] == [{"name": coefficient.name, "value": 0.1, "unit": "1"}]
+    expected = [{"name": coefficient.name, "value": 0.1, "unit": "1"}]
+    assert listed["coefficients"] == expected
     assert f"load-friction on J3: speed_exponent = 0, {coefficient.name} = 0.1 1" in exported.text
     assert "goes to qfrc_applied" in exported.text
     assert "Effects NOT in this model: load-friction on J3" in exported.text
@@ -416,13 +441,15 @@ def test_an_effect_that_is_not_installed_is_listed_with_its_package(
     effect = AcceptedEffect(
         "ring-friction", "J3", {}, (coefficient,), 6.1, 3.4, package="ring-effect 1.2.0"
     )
-    exported = export(robot, tmp_path, capsys, robot.with_effect(effect))
+    calibration = robot.with_effect(effect)
+    exported = export(robot, tmp_path, capsys, calibration)
     assert exported.report["effects_left_out"] == [
         "ring-friction on J3 (of ring-effect 1.2.0, not installed)"
     ]
     assert "Effects NOT in this model: ring-friction on J3 (of ring-effect 1.2.0" in exported.text
     (listed,) = exported.report["effects_not_in_mjcf"]
-    assert (listed["package"], listed["coefficients"][0]["value"]) == ("ring-effect 1.2.0", 0.1)
+    first_coefficient = listed["coefficients"][0]
+    assert (listed["package"], first_coefficient["value"]) == ("ring-effect 1.2.0", 0.1)
     assert "ring-friction on J3: ring-friction coefficient 1 = 0.1 Nm" in exported.text
 
 
@@ -433,17 +460,20 @@ def test_the_covariance_without_a_missing_effect_is_that_of_the_others() -> None
         "ring-friction", "J3", {}, (coefficient,), 6.1, 3.4, package="ring-effect 1.2.0"
     )
     known = robot.with_effect(effect)
-    known = replace(known, parameters=(known.parameters[-1], *known.parameters[:-1]))
+    last_parameter = known.parameters[-1]
+    parameters = (last_parameter, *known.parameters[:-1])
+    known = replace(known, parameters=parameters)
     size = len(known.gains) + len(known.parameters)
-    factor = np.tril(np.random.default_rng(1).normal(size=(size, size)))
+    rng = np.random.default_rng(1)
+    factor = np.tril(rng.normal(size=(size, size)))
     rows = tuple(tuple(row[: number + 1].tolist()) for number, row in enumerate(factor))
-    without, _ = split_installed(replace(known, covariance_factor=rows))
+    calibration = replace(known, covariance_factor=rows)
+    without, _ = split_installed(calibration)
     left = np.delete(np.arange(size), len(known.gains))
     assert without.parameters == known.parameters[1:]
     assert without.covariance is not None
-    np.testing.assert_allclose(
-        without.covariance, (factor @ factor.T)[np.ix_(left, left)], atol=1e-12
-    )
+    expected = (factor @ factor.T)[np.ix_(left, left)]
+    np.testing.assert_allclose(without.covariance, expected, atol=1e-12)
 
 
 def test_a_calibration_of_a_library_has_neither_date_nor_configuration(
@@ -454,7 +484,9 @@ def test_a_calibration_of_a_library_has_neither_date_nor_configuration(
     exported = export(robot, tmp_path, capsys, calibration)
     assert f"from the calibration of {calibration.cell}, without a date. " in exported.text
     assert exported.report["same_configuration"] is None
-    other = export(robot, tmp_path, capsys, replace(calibration, configuration_sha256="0" * 64))
+    configuration_sha256 = "0" * 64
+    changed_calibration = replace(calibration, configuration_sha256=configuration_sha256)
+    other = export(robot, tmp_path, capsys, changed_calibration)
     assert other.report["same_configuration"] is False
 
 
@@ -462,19 +494,20 @@ def test_springs_and_friction_of_passive_joints_are_at_their_joints(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     arm = robot_of("seven-axis")
-    spring = AcceptedEffect(
-        "spring", "J2", {}, (Parameter("spring stiffness 2", 30.0, 0.1, "Nm/rad"),), 6.0, 3.0
-    )
-    pushing = replace(spring, coefficients=(replace(spring.coefficients[0], value=-30.0),))
+    coefficients = (Parameter("spring stiffness 2", 30.0, 0.1, "Nm/rad"),)
+    spring = AcceptedEffect("spring", "J2", {}, coefficients, 6.0, 3.0)
+    changed_coefficient = replace(spring.coefficients[0], value=-30.0)
+    pushing = replace(spring, coefficients=(changed_coefficient,))
     chain = robot_of("five-bar")
     places = [joint.name for joint in chain.model.robot.places]
     elbow, other = (places.index(name) + 1 for name in ("elbow-1", "elbow-2"))
+    parameter = Parameter(f"passive-friction dry {elbow}", 0.4, 0.01, "Nm")
     friction = AcceptedEffect(
         "passive-friction",
         "elbow-1",
         {},
         (
-            Parameter(f"passive-friction dry {elbow}", 0.4, 0.01, "Nm"),
+            parameter,
             Parameter(f"passive-friction viscous {elbow}", 0.2, 0.01, "Nm/(rad/s)"),
         ),
         6.0,
@@ -528,11 +561,11 @@ def test_a_corrected_zero_is_in_the_frames_of_the_model(
     """Where the calibration corrects the description, recorded positions still mean the same."""
     robot = robot_of("kr270")
     offset = Parameter("zero-offset offset 3", 0.02, 1e-5, "rad")
-    corrected = robot.with_effect(
-        AcceptedEffect("zero-offset", "J3", {}, (offset,), 6.0, 3.0, described=(0.0,))
-    )
+    effect = AcceptedEffect("zero-offset", "J3", {}, (offset,), 6.0, 3.0, described=(0.0,))
+    corrected = robot.with_effect(effect)
     late = Parameter("late-position time 2", 0.001, 1e-5, "s")
-    delayed = robot.with_effect(AcceptedEffect("late-position", "J2", {}, (late,), 6.0, 3.0))
+    accepted_effect = AcceptedEffect("late-position", "J2", {}, (late,), 6.0, 3.0)
+    delayed = robot.with_effect(accepted_effect)
     exported = export(robot, tmp_path, capsys, corrected)
     assert exported.report["corrections_applied"] == ["zero-offset on J3"]
     assert exported.report["effects_left_out"] == []
@@ -553,7 +586,8 @@ def test_a_coupling_that_no_rotor_has_is_listed_and_exactly_it_is_missing(
     """Identified Ia may be less than the diagonal of its motors' r rᵀ;
     MuJoCo knows no negative armature.
     """
-    robot = calibrated_robot(CHECKOUT / "configs/cells/kr270.yaml", coupling=1.5)
+    cell_file = CHECKOUT / "configs/cells/kr270.yaml"
+    robot = calibrated_robot(cell_file, coupling=1.5)
     exported = export(robot, tmp_path, capsys)
     listed = [
         entry["name"]
@@ -583,31 +617,35 @@ def test_full_parameters_of_the_fit_are_written_as_they_are(
         else:
             basis = "data"
             share = 0.1
-        parameters.append(
-            FullParameter(
-                column.name, 1.01 * float(value), 0.1, column.unit, basis, share, None, None
-            )
+        full_parameter = FullParameter(
+            column.name, 1.01 * float(value), 0.1, column.unit, basis, share, None, None
         )
+        parameters.append(full_parameter)
+    urdf_sha256 = "a" * 64
     full = FullSet(
-        "arm.urdf", "a" * 64, 0.1, tuple(parameters), (), False, 1.0, 1.0, None, None, ()
+        "arm.urdf", urdf_sha256, 0.1, tuple(parameters), (), False, 1.0, 1.0, None, None, ()
     )
-    exported = export(robot, tmp_path, capsys, replace(robot.calibration, full_parameters=full))
+    calibration = replace(robot.calibration, full_parameters=full)
+    exported = export(robot, tmp_path, capsys, calibration)
     report = exported.report
     assert report["chosen_by"] == "full_parameters of the calibration"
     assert not report["exact"]
-    assert report["torque_change_percent"]["total"] == pytest.approx(1.0, abs=1e-6)
-    assert [one["value"] for one in report["parameters"]] == [one.value for one in parameters]
+    total = report["torque_change_percent"]["total"]
+    assert total == pytest.approx(1.0, abs=1e-6)
+    expected = [one.value for one in parameters]
+    assert [one["value"] for one in report["parameters"]] == expected
     assert [one["name"] for one in report["parameters"] if one["basis"] == "prior"] == ["m1"]
-    assert [one["prior_share"] for one in report["parameters"]] == [
-        one.prior_share for one in parameters
-    ]
+    prior_shares = [one["prior_share"] for one in report["parameters"]]
+    prior_shares_expected = [one.prior_share for one in parameters]
+    assert prior_shares == prior_shares_expected
     assert "By the prior, not measured: m1\n" in exported.text
     moving = is_moving(robot)
     found = inverse_nm(exported.text, robot) + exported.missing_nm
     assert apart(found[:, moving], 1.01 * robot.predicted_nm()[:, moving]) <= SAME
     # Of another robot they are refused.
     shorter = replace(full, parameters=full.parameters[1:])
-    file = robot.saved(tmp_path, replace(robot.calibration, full_parameters=shorter))
+    changed_calibration = replace(robot.calibration, full_parameters=shorter)
+    file = robot.saved(tmp_path, changed_calibration)
     assert (
         main(
             [
@@ -633,7 +671,8 @@ def test_numbers_that_rest_on_the_prior_are_marked(
     value = {one["name"]: one["value"] for one in exported.report["parameters"]}
     # The base does not move: of its mass and most of its inertia the torque says nothing, and the
     # prior all.
-    prior = dict(zip(("Ixx1", "m1"), inertia_prior(robot.cell.urdf).links[0][[0, 9]], strict=True))
+    first_link = inertia_prior(robot.cell.urdf).links[0]
+    prior = dict(zip(("Ixx1", "m1"), first_link[[0, 9]], strict=True))
     for name, expected in prior.items():
         assert basis[name] == "prior"
         assert value[name] == pytest.approx(expected, rel=1e-4)
@@ -653,13 +692,16 @@ def test_what_a_payload_adds_to_friction_is_no_part_of_the_model(
     source = CHECKOUT / "configs"
     (tmp_path / "cells").mkdir()
     (tmp_path / "robots").mkdir()
-    (tmp_path / "robots/tx40.urdf").write_bytes((source / "robots/tx40.urdf").read_bytes())
+    content = (source / "robots/tx40.urdf").read_bytes()
+    (tmp_path / "robots/tx40.urdf").write_bytes(content)
     cell = tmp_path / "cells/tx40.yaml"
-    cell.write_text((source / "cells/tx40.yaml").read_text() + "friction_by_payload: true\n")
+    text = (source / "cells/tx40.yaml").read_text()
+    cell.write_text(text + "friction_by_payload: true\n")
     robot = calibrated_robot(cell)
     assert "fs2_loaded" in [column.name for column in robot.model.columns]
     more = Parameter("fs2_loaded", 0.7, 0.01, "Nm")
-    calibration = replace(robot.calibration, parameters=(*robot.calibration.parameters, more))
+    parameters = (*robot.calibration.parameters, more)
+    calibration = replace(robot.calibration, parameters=parameters)
     exported = export(robot, tmp_path, capsys, calibration)
     assert exported.report["exact"]
     assert "_loaded" not in json.dumps(exported.report)
@@ -683,8 +725,10 @@ def test_a_moving_link_called_world_has_another_name(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The world is MuJoCo's own body; it refuses a second one."""
-    urdf = (CHECKOUT / "configs/robots/tx40.urdf").read_text().replace('"link3"', '"world"')
-    simulated = loaded(export(_tx40_of(tmp_path, urdf), tmp_path, capsys).text)
+    text = (CHECKOUT / "configs/robots/tx40.urdf").read_text()
+    urdf = text.replace('"link3"', '"world"')
+    robot = _tx40_of(tmp_path, urdf)
+    simulated = loaded(export(robot, tmp_path, capsys).text)
     data = mujoco.MjData(simulated)
     mujoco.mj_kinematics(simulated, data)
     assert data.site("world").xpos == pytest.approx(data.body("world link").xpos)
@@ -703,14 +747,17 @@ def test_frames_of_fixed_links_are_sites(
         'link="flange"/></joint>'
         "</robot>"
     )
-    robot = _tx40_of(tmp_path, urdf.replace("</robot>", tool))
-    simulated = loaded(export(robot, tmp_path, capsys).text)
+    changed_urdf = urdf.replace("</robot>", tool)
+    robot = _tx40_of(tmp_path, changed_urdf)
+    text = export(robot, tmp_path, capsys).text
+    simulated = loaded(text)
     data = mujoco.MjData(simulated)
     data.qpos[:] = robot.states.position_rad[3]
     mujoco.mj_kinematics(simulated, data)
     placed = poses(robot.model.robot, robot.states.position_rad[3:4])
     at_link = placed.rotation[6, 0]
-    assert data.body("link6").xpos == pytest.approx(placed.origin_m[6, 0], abs=1e-12)
+    xpos = data.body("link6").xpos
+    assert xpos == pytest.approx(placed.origin_m[6, 0], abs=1e-12)
     assert data.site("flange").xpos == pytest.approx(placed.origin_m[6, 0], abs=1e-12)
     assert data.site("tool").xpos == pytest.approx(
         placed.origin_m[6, 0] + at_link @ (0.1, 0.02, 0.3), abs=1e-12
@@ -730,9 +777,10 @@ def test_what_is_refused(
     assert main(command) == 2
     assert out.read_text() == "<mujoco/>"
     out.unlink()
+    relative_error_percent = replace(robot.calibration.relative_error_percent, total=90.0)
     poor = replace(
         robot.calibration,
-        relative_error_percent=replace(robot.calibration.relative_error_percent, total=90.0),
+        relative_error_percent=relative_error_percent,
     )
     robot.saved(tmp_path, poor)
     assert main(command) == 4
@@ -754,7 +802,8 @@ def test_the_terminal_says_what_the_model_holds_and_an_own_file_is_replaced(
     out = tmp_path / "robot.xml"
     command = ["export", "mjcf", str(robot.cell_file), str(file), "--out", str(out)]
     assert main(command) == 0
-    said = " ".join(capsys.readouterr().out.split())
+    printed = capsys.readouterr().out
+    said = " ".join(printed.split())
     assert "exactly the identified one" in said
     assert "tendon J6" in said
     assert "Not in the model: off1" in said
@@ -774,10 +823,10 @@ def test_the_example_of_the_page_runs(
     assert example is not None
     monkeypatch.chdir(tmp_path)
     exec(example[1], {})  # noqa: S102 - of this repository
-    torques, accelerations = capsys.readouterr().out.split("]")[:2]
-    assert float(torques.split("[")[1].split()[0]) == pytest.approx(
-        1.5 * robot.calibration.gains[0].value, rel=1e-3
-    )
+    printed = capsys.readouterr().out
+    torques, accelerations = printed.split("]")[:2]
+    gain = robot.calibration.gains[0].value
+    assert float(torques.split("[")[1].split()[0]) == pytest.approx(1.5 * gain, rel=1e-3)
     assert len(accelerations.split("[")[1].split()) == 6
 
 
@@ -795,5 +844,6 @@ def test_an_own_class_that_derives_from_a_spring_is_no_spring_of_the_model() -> 
     stiffness = np.array([12.0])
     numbers = numbers_of(Spring(), stiffness)
     assert numbers is not None
-    assert numbers.tolist() == [12.0, 0.0, 0.0, 0.0]
+    expected = [12.0, 0.0, 0.0, 0.0]
+    assert numbers.tolist() == expected
     assert numbers_of(StiffeningSpring(), stiffness) is None

@@ -51,12 +51,14 @@ def shelf() -> Shelf:
     """Two runs without load, two with."""
     truth = tx40_truth()
     rng = np.random.default_rng(3)
-    cell = load_cell(shipped_configurations() / "cells" / "demo.yaml")
+    path = shipped_configurations() / "cells" / "demo.yaml"
+    cell = load_cell(path)
     runs = {}
     for index in range(4):
         payload = MOUNTED if index % 2 else None
         run = record(truth, f"run{index}", rng, payload, noise_a=0.3, seconds=22.0)
-        runs[run.name] = replace(run, digest=f"{index:064x}")
+        digest = f"{index:064x}"
+        runs[run.name] = replace(run, digest=digest)
     undeclared = record(truth, "undeclared", rng, MOUNTED, noise_a=0.3, seconds=22.0)
     runs["undeclared"] = replace(undeclared, payload=None, digest="f" * 64)
     return Shelf(cell, runs)
@@ -78,10 +80,10 @@ def test_logs_become_sources_with_their_roles(
     shelf: Shelf, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(fit_module, "load_run", shelf.load)
-    found = fit(_paths("run0", "run1", "run2"), holdout=_paths("run3"))
-    assert [(source.name, source.role) for source in found.sources] == [
-        ("run0", "fit"), ("run1", "fit"), ("run2", "fit"), ("run3", "holdout"),
-    ]  # fmt: skip
+    logs = _paths("run0", "run1", "run2")
+    found = fit(logs, holdout=_paths("run3"))
+    expected = [("run0", "fit"), ("run1", "fit"), ("run2", "fit"), ("run3", "holdout")]
+    assert [(source.name, source.role) for source in found.sources] == expected  # fmt: skip
     assert [(source.payload, source.mounting) for source in found.sources] == [
         (None, None) if run.payload is None else (run.payload.name, run.payload.mounting)
         for run in (shelf.runs[source.name] for source in found.sources)
@@ -94,14 +96,16 @@ def test_the_log_that_contradicts_the_others_is_named(
     shelf: Shelf, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(fit_module, "load_run", shelf.load)
+    logs = _paths("undeclared", "run1", "run2", "run3")
     with pytest.raises(PayloadUnseen, match="without undeclared they do"):
-        fit(_paths("undeclared", "run1", "run2", "run3"))
+        fit(logs)
 
 
 def test_a_recording_counts_once(shelf: Shelf, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fit_module, "load_run", shelf.load)
+    logs = _paths("run0", "run1")
     with pytest.raises(LogRepeated):
-        fit(_paths("run0", "run1"), holdout=_paths("run1"))
+        fit(logs, holdout=_paths("run1"))
 
 
 def test_logs_of_two_configurations_are_refused(
@@ -129,8 +133,10 @@ def test_a_cut_off_beyond_the_sampling_rate_is_named_by_its_key(
     shelf: Shelf, monkeypatch: pytest.MonkeyPatch, key: str, conditioning: Conditioning
 ) -> None:
     monkeypatch.setattr(fit_module, "load_run", shelf.load)
+    logs = _paths("run0", "run1")
+    cell = replace(shelf.cell, conditioning=conditioning)
     with pytest.raises(DataUnfit, match=f"`conditioning.{key}` of 900 Hz needs more than 2250 Hz"):
-        fit(_paths("run0", "run1"), cell=replace(shelf.cell, conditioning=conditioning))
+        fit(logs, cell=cell)
 
 
 @pytest.mark.parametrize("method", [Method.LS, Method.WLS, Method.TLS])
@@ -138,8 +144,9 @@ def test_every_method_hears_of_a_payload_that_was_not_there(
     shelf: Shelf, monkeypatch: pytest.MonkeyPatch, method: Method
 ) -> None:
     monkeypatch.setattr(fit_module, "load_run", shelf.load)
+    logs = _paths("undeclared", "run1", "run2", "run3")
     with pytest.raises(PayloadUnseen):
-        fit(_paths("undeclared", "run1", "run2", "run3"), method=method)
+        fit(logs, method=method)
 
 
 def moves_in(found: Fit) -> int:
@@ -157,12 +164,17 @@ def test_a_sigma_of_few_moves_is_said_to_be_rough(
     (percent,) = re.findall(r"known to (\d+) % only", note)
     assert f"σ rests on {moves} moves" in note
     # The scatter of a σ that is estimated from so many normal numbers.
-    numbers = np.random.default_rng(1).standard_normal((20_000, moves))
-    assert float(percent) == pytest.approx(100.0 * np.std(numbers.std(axis=1, ddof=1)), abs=1.0)
+    rng = np.random.default_rng(1)
+    numbers = rng.standard_normal((20_000, moves))
+    number_std = numbers.std(axis=1, ddof=1)
+    number_std_std = np.std(number_std)
+    assert float(percent) == pytest.approx(100.0 * number_std_std, abs=1.0)
     (ratio,) = re.findall(r"a factor of ([\d.]+)\.", note)
     assert float(ratio) > 1.0 + 0.04 * float(percent)
-    assert [*sigma_notes(fit(_paths("run0", "run1"), method=Method.TLS))] == []  # by a formula
-    assert [*sigma_notes(fit(_paths("run0", "run1"), gains_fixed=True))] == []
+    fitted = fit(_paths("run0", "run1"), method=Method.TLS)
+    assert [*sigma_notes(fitted)] == []  # by a formula
+    logs = _paths("run0", "run1")
+    assert [*sigma_notes(fit(logs, gains_fixed=True))] == []
     monkeypatch.setattr("daq.report.fit.ROUGH_SIGMA", 1.0 / np.sqrt(2.0 * (moves - 1)))
     assert [*sigma_notes(found)] == []
 
@@ -171,17 +183,19 @@ def test_an_axis_that_did_not_move_has_a_dash_and_no_number(
     shelf: Shelf, pair: Fit, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(fit_module, "load_run", shelf.load)
-    calibration = calibration_of(pair, datetime(2025, 1, 2, tzinfo=UTC))
-    rested = RelativeError((1.0, float("nan"), 3.0, 4.0, 5.0, 6.0), 7.0)
+    created = datetime(2025, 1, 2, tzinfo=UTC)
+    calibration = calibration_of(pair, created)
+    axes = (1.0, float("nan"), 3.0, 4.0, 5.0, 6.0)
+    rested = RelativeError(axes, 7.0)
     out = io.StringIO()
     rested_on = replace(calibration, holdout_error_percent=rested)
-    Console(file=out, width=100).print(
-        *fit_view(CaseFit(pair, (), None), rested_on, None), sep="\n"
-    )
-    (held_out,) = (
-        line.split() for line in out.getvalue().splitlines() if line.strip().startswith("held out")
-    )
-    assert held_out == ["held", "out", "1.00", "-", "3.00", "4.00", "5.00", "6.00", "7.00"]
+    console = Console(file=out, width=100)
+    case_fit = CaseFit(pair, (), None)
+    console.print(*fit_view(case_fit, rested_on, None), sep="\n")
+    lines = out.getvalue().splitlines()
+    (held_out,) = (line.split() for line in lines if line.strip().startswith("held out"))
+    expected = ["held", "out", "1.00", "-", "3.00", "4.00", "5.00", "6.00", "7.00"]
+    assert held_out == expected
 
 
 def test_the_drives_own_torque_is_shown_beside_the_gains_and_changes_none(
@@ -199,29 +213,36 @@ def test_the_drives_own_torque_is_shown_beside_the_gains_and_changes_none(
             rows = slice(0, 0) if axis == 5 else slice(12, -12, 12)
             current = run.current_a[rows, axis]
             torque = 1.04 * gain * current + 0.5 * rng.standard_normal(len(current))
-            channels.append(TorqueChannel(run.time_s[rows], current, current, torque))
+            torque_channel = TorqueChannel(run.time_s[rows], current, current, torque)
+            channels.append(torque_channel)
         return replace(run, torque_channels=tuple(channels)), described
 
     monkeypatch.setattr(fit_module, "load_run", shelf.load)
-    without = fit(_paths("run0", "run1"), holdout=_paths("run2"))
+    logs = _paths("run0", "run1")
+    without = fit(logs, holdout=_paths("run2"))
     monkeypatch.setattr(fit_module, "load_run", load)
     found = fit(_paths("run0", "run1"), holdout=_paths("run2"))
     np.testing.assert_array_equal(found.estimate.gains, without.estimate.gains)
     assert without.torque_slopes == ()
     assert found.torque_slopes[5] is None
-    calibration = calibration_of(found, datetime(2025, 1, 2, tzinfo=UTC))
+    created = datetime(2025, 1, 2, tzinfo=UTC)
+    calibration = calibration_of(found, created)
     case = CaseFit(found, (), None)
-    rows = json_tree(fit_report(case, calibration, None))["torque_channel"]
-    assert [row["axis"] for row in rows] == list(found.cell.axis_names)
+    report = fit_report(case, calibration, None)
+    rows = json_tree(report)["torque_channel"]
+    expected = list(found.cell.axis_names)
+    assert [row["axis"] for row in rows] == expected
     assert rows[5] == {"axis": "J6", "slope": None}
     for slope, row, gain in zip(found.torque_slopes[:5], rows, GAINS, strict=False):
         assert slope is not None
-        assert abs(slope.value - 1.04 * gain) < 4.0 * slope.std
-        assert abs(row["ratio"] - 1.04) < 4.0 * row["ratio_std"] < 0.1
+        absolute_slope = abs(slope.value - 1.04 * gain)
+        assert absolute_slope < 4.0 * slope.std
+        absolute_ratio = abs(row["ratio"] - 1.04)
+        assert absolute_ratio < 4.0 * row["ratio_std"] < 0.1
         assert slope.readings == len(range(12, 5500 - 12, 12)) * 2
-    assert "torque_channel" not in json_tree(
-        fit_report(CaseFit(without, (), None), calibration, None)
-    )
+    case_fit = CaseFit(without, (), None)
+    assert "torque_channel" not in json_tree(fit_report(case_fit, calibration, None))
     out = io.StringIO()
-    Console(file=out, width=80).print(*fit_view(case, calibration, None), sep="\n")
+    console = Console(file=out, width=80)
+    console.print(*fit_view(case, calibration, None), sep="\n")
     assert "own torque against the current, not used in the fit" in out.getvalue()

@@ -28,9 +28,8 @@ WARMER = 0.75  #: Friction in the loaded runs over that in the bare ones, which 
 
 @pytest.fixture(scope="module")
 def cell() -> Cell:
-    return replace(
-        load_cell(shipped_configurations() / "cells" / "demo.yaml"), friction_by_payload=True
-    )
+    path = shipped_configurations() / "cells" / "demo.yaml"
+    return replace(load_cell(path), friction_by_payload=True)
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +44,8 @@ def shelf(cell: Cell) -> Shelf:
         [(truth, None), (truth, None), (warm, MOUNTED), (warm, MOUNTED)]
     ):
         run = record(arm, f"run{number}", rng, payload, noise_a=0.05, seconds=22.0)
-        runs[run.name] = replace(run, digest=f"{number:064x}")
+        digest = f"{number:064x}"
+        runs[run.name] = replace(run, digest=digest)
     return Shelf(cell, runs)
 
 
@@ -54,21 +54,24 @@ def test_gains_are_true_and_the_calibration_predicts_with_the_friction_of_the_pa
 ) -> None:
     monkeypatch.setattr(fit_module, "load_run", shelf.load)
     monkeypatch.setattr(validate_module, "load_run", shelf.load)
-    fitted = fit([Path("run0"), Path("run1"), Path("run2")])
+    logs = [Path("run0"), Path("run1"), Path("run2")]
+    fitted = fit(logs)
     assert np.all(np.abs(fitted.estimate.gains / GAINS - 1.0) < 0.01)
     file = tmp_path / "calibration.yaml"
-    save_calibration(calibration_of(fitted, datetime(2026, 1, 5, tzinfo=UTC)), file)
+    created = datetime(2026, 1, 5, tzinfo=UTC)
+    save_calibration(calibration_of(fitted, created), file)
     calibration = load_calibration(file)
     names = {parameter.name for parameter in calibration.parameters}
     assert {"fs1_loaded", "fv6_loaded", "fsm6_loaded"} <= names
     # Of a loaded run that no fit has seen.
     (validation,) = validate(calibration, [Path("run3")], shelf.cell)
+    parameters = tuple(
+        replace(one, value=0.0) if one.name.endswith("_loaded") else one
+        for one in calibration.parameters
+    )
     forgetful = replace(
         calibration,
-        parameters=tuple(
-            replace(one, value=0.0) if one.name.endswith("_loaded") else one
-            for one in calibration.parameters
-        ),
+        parameters=parameters,
     )
     (without,) = validate(forgetful, [Path("run3")], shelf.cell)
     assert without.error.total > 2.0 * validation.error.total
@@ -77,16 +80,17 @@ def test_gains_are_true_and_the_calibration_predicts_with_the_friction_of_the_pa
 def test_without_the_key_friction_that_falls_becomes_gain(
     shelf: Shelf, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    without_key = replace(shelf, cell=replace(shelf.cell, friction_by_payload=False))
+    changed_cell = replace(shelf.cell, friction_by_payload=False)
+    without_key = replace(shelf, cell=changed_cell)
     monkeypatch.setattr(fit_module, "load_run", without_key.load)
-    fitted = fit([Path("run0"), Path("run1"), Path("run2")])
+    logs = [Path("run0"), Path("run1"), Path("run2")]
+    fitted = fit(logs)
     assert np.max(np.abs(fitted.estimate.gains / GAINS - 1.0)) > 0.015
 
 
 def test_a_description_that_differs_in_it_is_another_one_for_a_fit(cell: Cell) -> None:
-    assert differing_sections(cell, replace(cell, friction_by_payload=False)) == (
-        "friction_by_payload",
-    )
+    changed_cell = replace(cell, friction_by_payload=False)
+    assert differing_sections(cell, changed_cell) == ("friction_by_payload",)
 
 
 def test_the_key_is_read_and_is_off_where_a_cell_file_does_not_have_it(tmp_path: Path) -> None:

@@ -26,13 +26,15 @@ from tests.daq.calibrations import AXES, demo_calibration
 @pytest.fixture(scope="module")
 def urdf(checkout: Path) -> str:
     """The TX-40's URDF, with rough inertias."""
-    return (checkout / "configs" / "robots" / "tx40.urdf").read_text(encoding="utf-8")
+    robots_folder = checkout / "configs" / "robots"
+    return (robots_folder / "tx40.urdf").read_text(encoding="utf-8")
 
 
 @pytest.fixture(scope="module")
 def fitted(real: tuple[Path, Path]) -> Fit:
     """The real TX-40 with its gains fixed."""
-    return fit([real[1]], gains_fixed=True)
+    logs = [real[1]]
+    return fit(logs, gains_fixed=True)
 
 
 def _fit(log: Path, *options: object) -> int:
@@ -49,7 +51,8 @@ def test_every_parameter_of_the_real_robot_has_a_value_a_sigma_and_a_basis(
     assert (
         _fit(log, "--method", "ml", "--prior-tolerance", 0.2, "--out", out, "--json") == ExitCode.OK
     )
-    document = json.loads(capsys.readouterr().out)["full_parameters"]
+    printed = capsys.readouterr().out
+    document = json.loads(printed)["full_parameters"]
     assert document["urdf"] == OF_CELL
     assert document["contradictions"] == []
     assert document["gains"] == []
@@ -57,8 +60,10 @@ def test_every_parameter_of_the_real_robot_has_a_value_a_sigma_and_a_basis(
     assert len(parameters) == 87
     assert parameters["fv1"]["basis"] == "data"
     assert parameters["m1"]["basis"] == "prior"
-    assert parameters["m1"]["value"] == pytest.approx(parameters["m1"]["prior"])
-    assert parameters["m1"]["std"] == pytest.approx(0.2 * parameters["m1"]["prior"])
+    prior = parameters["m1"]["prior"]
+    assert parameters["m1"]["value"] == pytest.approx(prior)
+    std = parameters["m1"]["std"]
+    assert std == pytest.approx(0.2 * parameters["m1"]["prior"])
     assert all(one["std"] > 0.0 for one in parameters.values())
     assert all(parameters[f"m{number}"]["value"] > 0.0 for number in range(1, 7))
     # The torque of the full set is that of the fit: its combinations are the base parameters,
@@ -71,8 +76,10 @@ def test_every_parameter_of_the_real_robot_has_a_value_a_sigma_and_a_basis(
         value = 0.0
         for sign, size, name in terms:
             value += float(f"{sign}{size or 1.0}") * parameters[name]["value"]
-        differences.append((value - base.value) / base.std)
-    assert np.median(np.abs(differences)) < 1.0
+        difference = value - base.value
+        differences.append(difference / base.std)
+    median_absolute_difference = np.median(np.abs(differences))
+    assert median_absolute_difference < 1.0
 
 
 def test_masses_that_are_wrong_are_said(fitted: Fit, urdf: str) -> None:
@@ -94,7 +101,8 @@ def _scaled(urdf: str, factor: float) -> str:
 def test_a_urdf_that_is_no_prior_of_this_robot_is_refused(
     fitted: Fit, urdf: str, checkout: Path
 ) -> None:
-    other = (checkout / "configs" / "robots" / "gantry.urdf").read_text(encoding="utf-8")
+    robots_folder = checkout / "configs" / "robots"
+    other = (robots_folder / "gantry.urdf").read_text(encoding="utf-8")
     longer = urdf.replace("0.225 0 0.035", "0.250 0 0.035")
     assert longer != urdf
     bare = re.sub(r"(?s)<inertial>.*?</inertial>", "", urdf)
@@ -110,7 +118,8 @@ def test_a_urdf_that_is_no_prior_of_this_robot_is_refused(
 
 def test_gains_by_an_estimator_without_sigma_by_moves_are_refused(fitted: Fit, urdf: str) -> None:
     estimate = replace(fitted.identification.estimate, method=Method.WLS, gains_fixed=False)
-    free = replace(fitted, identification=replace(fitted.identification, estimate=estimate))
+    identification = replace(fitted.identification, estimate=estimate)
+    free = replace(fitted, identification=identification)
     with pytest.raises(UsageError, match="expected ml, whose σ comes from leaving out moves"):
         full_set(free, urdf, "arm.urdf", 0.1)
 
@@ -127,15 +136,19 @@ def test_options_that_leave_parameters_out_are_refused_before_any_work(
 
 
 def test_the_full_set_comes_back_from_the_file_and_older_files_have_none() -> None:
+    full_parameter = FullParameter("m2", 3.4, 0.3, "kg", "prior", 0.8, 3.5, 0.35)
+    parameters = (
+        full_parameter,
+        FullParameter("fv2", 5.5, 0.05, "Nm/(rad/s)", "data", 0.0, None, None),
+    )
+    gains = tuple(GainWithPrior(axis, 30.0, 0.1) for axis in AXES)
+    urdf_sha256 = "a" * 64
     full = FullSet(
         urdf="arm.urdf",
-        urdf_sha256="a" * 64,
+        urdf_sha256=urdf_sha256,
         tolerance=0.1,
-        parameters=(
-            FullParameter("m2", 3.4, 0.3, "kg", "prior", 0.8, 3.5, 0.35),
-            FullParameter("fv2", 5.5, 0.05, "Nm/(rad/s)", "data", 0.0, None, None),
-        ),
-        gains=tuple(GainWithPrior(axis, 30.0, 0.1) for axis in AXES),
+        parameters=parameters,
+        gains=gains,
         bounded=False,
         chi_square=31.0,
         degrees_of_freedom=34,
@@ -149,7 +162,5 @@ def test_the_full_set_comes_back_from_the_file_and_older_files_have_none() -> No
     older = yaml.safe_load(encode_calibration(demo_calibration()))
     del older["full_parameters"]
     del older["digests"]["full_parameters"]
-    assert (
-        decode_calibration(yaml.safe_dump(older).encode(), "calibration.yaml").full_parameters
-        is None
-    )
+    encoded_text = yaml.safe_dump(older).encode()
+    assert decode_calibration(encoded_text, "calibration.yaml").full_parameters is None

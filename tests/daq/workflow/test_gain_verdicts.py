@@ -26,7 +26,8 @@ def fitted() -> Iterator[Fit]:
     """Short and noisy: some gains are weak."""
     truth = tx40_truth()
     rng = np.random.default_rng(6)
-    cell = load_cell(shipped_configurations() / "cells" / "demo.yaml")
+    demo_path = shipped_configurations() / "cells" / "demo.yaml"
+    cell = load_cell(demo_path)
     runs = {
         name: replace(record(truth, name, rng, payload, noise_a=0.6, seconds=14.0), digest=name)
         for name, payload in (("bare", None), ("loaded", MOUNTED))
@@ -39,14 +40,17 @@ def fitted() -> Iterator[Fit]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(fit_module, "load_run", load)
-        yield fit((Path("bare"), Path("loaded")))
+        logs = (Path("bare"), Path("loaded"))
+        yield fit(logs)
 
 
 def test_the_deviations_are_the_fits_own_and_weak_gains_get_advice(fitted: Fit) -> None:
     estimate = fitted.identification.estimate
     found = gain_verdicts(fitted)
-    own = 100.0 * estimate.gains_std / np.abs(estimate.gains)
-    assert [gain.std_percent for gain in found] == pytest.approx(own.tolist())
+    absolute_gain = np.abs(estimate.gains)
+    own = 100.0 * estimate.gains_std / absolute_gain
+    std_percent = [gain.std_percent for gain in found]
+    assert std_percent == pytest.approx(own.tolist())
     assert (not needed_verdicts(fitted)) == bool(np.all(own <= GOOD_PERCENT))
     weak = [gain for gain in found if gain.verdict is not Visibility.GOOD]
     assert weak
@@ -57,5 +61,6 @@ def test_the_deviations_are_the_fits_own_and_weak_gains_get_advice(fitted: Fit) 
 
 def test_gravity_does_not_act_on_the_vertical_axis(fitted: Fit) -> None:
     found = gain_verdicts(fitted)
-    assert [gain.gravity_acts for gain in found] == [False, True, True, True, True, True]
+    expected = [False, True, True, True, True, True]
+    assert [gain.gravity_acts for gain in found] == expected
     assert "J1 is identifiable only through inertia" in found[0].words("J1")

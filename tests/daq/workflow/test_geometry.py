@@ -63,9 +63,12 @@ def _positions(seed: int) -> FloatArray:
     time_s = np.arange(0.0, 9.0, 1.0 / RATE_HZ)[:, None, None]
     frequency_hz = rng.uniform(0.2, 1.4, (4, 5))
     phase = rng.uniform(0.0, 2.0 * np.pi, (4, 5))
-    wished = 0.06 * np.sum(np.sin(2.0 * np.pi * frequency_hz * time_s + phase), axis=2)
-    home = model.assembly.position_rad[list(model.robot.axis_joints)]
-    found = reach(model.robot, model.assembly, home + wished).position_rad
+    phase_sine = np.sin(2.0 * np.pi * frequency_hz * time_s + phase)
+    wished = 0.06 * np.sum(phase_sine, axis=2)
+    axis_joints = list(model.robot.axis_joints)
+    home = model.assembly.position_rad[axis_joints]
+    axes_rad = home + wished
+    found = reach(model.robot, model.assembly, axes_rad).position_rad
     axes = found[:, list(model.robot.axis_joints)]
     assert np.allclose(positions(model.robot, model.assembly, axes), found, atol=1e-8)
     return axes
@@ -85,11 +88,13 @@ def _runs() -> tuple[Run, Run]:
     made: list[Run] = []
     for seed, payload in ((3, None), (4, body)):
         exact = _positions(seed)
+        time_s = np.arange(len(exact)) / RATE_HZ
+        current_a = np.zeros_like(exact)
         blank = Run(
             LOGS[len(made)].stem,
-            np.arange(len(exact)) / RATE_HZ,
+            time_s,
             exact,
-            np.zeros_like(exact),
+            current_a,
             payload,
         )
         data = differentiate(blank, model.drive_train, CELL.conditioning)
@@ -98,19 +103,23 @@ def _runs() -> tuple[Run, Run]:
             mass_kg = payload.known["m"]
             mounted[model.flange] += 0.05, 0.0, 0.0, 0.05, 0.0, 0.09, 0.9, 0.3, 0.0, mass_kg
         torque = np.einsum("mck,c->km", model.regressor(data.motion()), mounted)
-        hidden = np.linalg.qr(model.follow(data.motion()).to_motors, mode="complete").Q[:, :, 3]
-        hidden = hidden * np.sign(hidden[:, :1])
+        to_motors = model.follow(data.motion()).to_motors
+        hidden = np.linalg.qr(to_motors, mode="complete").Q[:, :, 3]
+        hidden_sign = np.sign(hidden[:, :1])
+        hidden = hidden * hidden_sign
         torque = torque + (1.0 + 2.0 * np.sin(1.3 * data.time_s))[:, None] * hidden
         current = 0.004 * rng.standard_normal(exact.shape)
         current[1:-1] += torque / GAINS
         counted = COUNT_RAD * np.round(exact / COUNT_RAD)
-        made.append(replace(blank, position_rad=counted, current_a=current))
+        changed_blank = replace(blank, position_rad=counted, current_a=current)
+        made.append(changed_blank)
     return made[0], made[1]
 
 
 def _read(cell: Cell, monkeypatch: pytest.MonkeyPatch) -> None:
     """Let logs be those runs, as another description of the cell converts them."""
-    offset = np.array([axis.zero_offset_rad for axis in cell.axes])
+    zero_offset_rad = [axis.zero_offset_rad for axis in cell.axes]
+    offset = np.array(zero_offset_rad)
     runs = dict(zip(LOGS, _runs(), strict=True))
 
     def load_run(
@@ -118,7 +127,8 @@ def _read(cell: Cell, monkeypatch: pytest.MonkeyPatch) -> None:
     ) -> tuple[Run, Cell]:
         del given, lossy
         run = runs[Path(path)]
-        return replace(run, position_rad=run.position_rad + offset), cell
+        position_rad = run.position_rad + offset
+        return replace(run, position_rad=position_rad), cell
 
     monkeypatch.setattr(fitting, "load_run", load_run)
 
@@ -134,12 +144,15 @@ def _with_zero(degrees: float) -> Cell:
 def _with_rod(percent: float) -> Cell:
     before, name, after = CELL.urdf.partition('<joint name="tip-3"')
     longer = f'xyz="{0.28 * (1.0 + percent / 100.0)!r} 0 0"'
-    return replace(CELL, urdf=before + name + after.replace('xyz="0.28 0 0"', longer, 1))
+    changed_after = after.replace('xyz="0.28 0 0"', longer, 1)
+    urdf = before + name + changed_after
+    return replace(CELL, urdf=urdf)
 
 
 def _errors(fitted: Fit) -> FloatArray:
     """Errors of the gains in their σ."""
-    return np.asarray((fitted.estimate.gains - GAINS) / fitted.estimate.gains_std)
+    gain_difference = fitted.estimate.gains - GAINS
+    return np.asarray(gain_difference / fitted.estimate.gains_std)
 
 
 @pytest.fixture(scope="module")
@@ -156,12 +169,8 @@ def test_a_right_description_is_fitted_as_it_is(clean: Fit) -> None:
     assert with_corrected_geometry(clean) is clean
     kept = calibration_of(clean, RECORDED).encoder_misfit
     assert kept is not None
-    assert (kept.applied, kept.significant, kept.corrections, kept.unit) == (
-        False,
-        False,
-        (),
-        "rad",
-    )
+    expected = (False, False, (), "rad")
+    assert (kept.applied, kept.significant, kept.corrections, kept.unit) == expected
     assert np.all(np.abs(_errors(clean)) < 3.0)
 
 
@@ -201,7 +210,8 @@ def test_a_wrong_number_is_named_and_corrected(
     assert fitted.geometry is not None
     (correction,) = fitted.geometry.corrections
     assert correction.parameter == parameter
-    assert abs(correction.change - change) < 4.0 * correction.std
+    change_difference = abs(correction.change - change)
+    assert change_difference < 4.0 * correction.std
     corrected = with_corrected_geometry(fitted)
     assert with_corrected_geometry(corrected) is corrected
     assert np.all(np.abs(_errors(corrected)) < 3.0)
@@ -209,19 +219,22 @@ def test_a_wrong_number_is_named_and_corrected(
         assert np.max(np.abs(_errors(fitted))) > 3.0
     assert np.all(corrected.estimate.gains_std < 1.5 * clean.estimate.gains_std)
     assert corrected.geometry_covariance is not None
-    added = np.sqrt(np.diag(corrected.geometry_covariance))[: len(GAINS)]
+    geometry_covariance_diagonal = np.diag(corrected.geometry_covariance)
+    added = np.sqrt(geometry_covariance_diagonal)[: len(GAINS)]
     assert np.all((added > 0.0) & (added < corrected.estimate.gains_std))
     (diagnosis,) = geometry_diagnoses(corrected.geometry, cell, applied=True)
     assert "corrected geometry" in diagnosis.remedy
     # The calibration keeps the correction, and predicts with it, whatever the description says now.
-    calibration = calibration_of(replace(corrected, diagnoses=(diagnosis,)), RECORDED)
+    changed_corrected = replace(corrected, diagnoses=(diagnosis,))
+    calibration = calibration_of(changed_corrected, RECORDED)
     save_calibration(calibration, tmp_path / "calibration.yaml")
     read = load_calibration(tmp_path / "calibration.yaml")
     assert read.encoder_misfit == calibration.encoder_misfit
     for described in (cell, CELL):
         robot = calibrated_model(read, described).robot
         turned = robot.joints[robot.axis_joints[1]].rotation
-        expected = model_of(CELL).robot.joints[robot.axis_joints[1]].rotation
+        joints = model_of(CELL).robot.joints
+        expected = joints[robot.axis_joints[1]].rotation
         offset = described.axes[1].zero_offset_rad
         assert np.arccos(
             np.clip(0.5 * (np.trace(expected.T @ turned) - 1.0), -1.0, 1.0)
@@ -229,13 +242,17 @@ def test_a_wrong_number_is_named_and_corrected(
         assert described_length(robot, ROD) == pytest.approx(0.28, abs=2e-6)
     if parameter is ZERO:
         assert calibration.encoder_misfit is not None
-        correction_of_another = replace(calibration.encoder_misfit.corrections[0], joint="motor-2")
+        first_correction = calibration.encoder_misfit.corrections[0]
+        correction_of_another = replace(first_correction, joint="motor-2")
         misfit = replace(calibration.encoder_misfit, corrections=(correction_of_another,))
+        changed_read = replace(read, encoder_misfit=misfit)
         with pytest.raises(ModelError, match="'motor-2' was corrected, and no axis"):
-            calibrated_model(replace(read, encoder_misfit=misfit), cell)
-    certificate = certify(read, without_controller(read, "not read", RECORDED))
+            calibrated_model(changed_read, cell)
+    comparison = without_controller(read, "not read", RECORDED)
+    certificate = certify(read, comparison)
     document = json_tree(certificate_report(certificate))
-    assert document["encoder_misfit"]["corrections"][0]["kind"] == parameter.kind.value
+    corrections = document["encoder_misfit"]["corrections"]
+    assert corrections[0]["kind"] == parameter.kind.value
     assert "the gains are those of the corrected geometry" in document["identity"]["Encoders"]
 
 
@@ -244,16 +261,19 @@ def test_the_uncertainty_of_the_geometry_reaches_the_gains_beside_effects(clean:
     with pytest.MonkeyPatch.context() as patch:
         _read(CELL, patch)
         evidence = gather(fitted, _runs())
-    joined = with_effects(evidence, (PlacedEffect(Spring(), 1),))
+    effects = (PlacedEffect(Spring(), 1),)
+    joined = with_effects(evidence, effects)
     assert joined.identification.estimate is joined.estimate
     count = len(evidence.estimate.covariance)
     gains = len(GAINS)
     # In another order, and with a parameter that the estimate with effects lacks, as after another
     # turn of gravity.
-    unknowns = (Column("of another gravity", "kg m"), *reversed(evidence.estimate.unknowns))
+    reversed_unknowns = reversed(evidence.estimate.unknowns)
+    unknowns = (Column("of another gravity", "kg m"), *reversed_unknowns)
     extra = np.diag(np.arange(1.0, count + 2.0))
     changed = evidence_with_geometry(joined, extra, unknowns)
-    difference = np.diag(changed.estimate.covariance - joined.estimate.covariance)
+    covariance_difference = changed.estimate.covariance - joined.estimate.covariance
+    difference = np.diag(covariance_difference)
     names = [column.name for column in joined.estimate.unknowns]
     added = {column.name: float(number) for number, column in enumerate(unknowns, start=gains + 1)}
     assert list(difference[:gains]) == pytest.approx([1.0, 2.0, 3.0, 4.0])
@@ -268,13 +288,16 @@ def test_the_uncertainty_of_the_geometry_is_in_sigma_once(monkeypatch: pytest.Mo
     monkeypatch.setattr(fitting, "find_effects", partial(find_effects, families=(), geometry=()))
     fitted = fit(LOGS, keep_rows=True)
     closed = close_loop(fitted, 0)
-    assert closed.steps[-1].after.effects == ()
+    last_step = closed.steps[-1]
+    assert last_step.after.effects == ()
     assert closed.geometry_covariance is not None
     bare = closed.evidence().training.system()
-    expected = estimate_with(Method.ML, bare).covariance + closed.geometry_covariance
+    covariance = estimate_with(Method.ML, bare).covariance
+    expected = covariance + closed.geometry_covariance
     assert closed.identification.estimate.covariance == pytest.approx(expected, rel=1e-6, abs=1e-15)
+    expected_diagonal_root = np.sqrt(np.diag(expected))
     assert closed.estimate.gains_std == pytest.approx(
-        np.sqrt(np.diag(expected))[: len(GAINS)], rel=1e-6
+        expected_diagonal_root[: len(GAINS)], rel=1e-6
     )
     again = close_loop(closed, 0)
     assert again.estimate.gains_std == pytest.approx(closed.estimate.gains_std, rel=1e-6)
@@ -289,7 +312,8 @@ def test_the_alternative_that_moves_gains_by_most_of_their_sigma_counts(clean: F
     few[int(np.argmax(std))] = 1.0 * std.max()
     many = np.zeros(len(clean.estimate.covariance))
     many[int(np.argmin(std))] = 3.0 * std.min()
-    assert shift_in_sigmas(few, clean.estimate) == pytest.approx(1.0)
+    shift = shift_in_sigmas(few, clean.estimate)
+    assert shift == pytest.approx(1.0)
     assert shift_in_sigmas(many, clean.estimate) == pytest.approx(3.0)
 
 
@@ -303,7 +327,8 @@ def _finding(
 def test_what_encoders_cannot_tell_apart_is_said() -> None:
     zero = GeometryEstimate(ZERO, 1e-3, 1e-5)
     rod = GeometryEstimate(ROD, -3e-4, 1e-6)
-    (one,) = geometry_diagnoses(_finding(zero, alternatives=((rod,),)), CELL, applied=False)
+    finding = _finding(zero, alternatives=((rod,),))
+    (one,) = geometry_diagnoses(finding, CELL, applied=False)
     assert one.name == "zero-off"
     assert (
         "not distinguishable from a length from elbow-3 to arm-3 that is 0.3000 ± 0.0010 mm shorter"
@@ -338,7 +363,8 @@ def test_a_misfit_that_nothing_explains_is_called_so() -> None:
 
 
 def test_a_late_encoder_is_named_and_not_corrected(tmp_path: Path, clean: Fit) -> None:
-    late = GeometryEstimate(GeometryParameter(GeometryKind.DELAY, "crank-2"), 0.003, 1e-6)
+    parameter = GeometryParameter(GeometryKind.DELAY, "crank-2")
+    late = GeometryEstimate(parameter, 0.003, 1e-6)
     (one,) = geometry_diagnoses(_finding(late), CELL, applied=False)
     assert (one.name, one.axes) == ("position-late", ("crank-2",))
     assert "an encoder of crank-2 that is late by 3.0000 ± 0.0010 ms explains alone" in one.found
@@ -348,7 +374,8 @@ def test_a_late_encoder_is_named_and_not_corrected(tmp_path: Path, clean: Fit) -
     assert with_corrected_geometry(fitted) is fitted
     calibration = calibration_of(fitted, RECORDED)
     save_calibration(calibration, tmp_path / "calibration.yaml")
-    kept = load_calibration(tmp_path / "calibration.yaml").encoder_misfit
+    path = tmp_path / "calibration.yaml"
+    kept = load_calibration(path).encoder_misfit
     assert kept == calibration.encoder_misfit
     assert kept is not None
     assert (kept.corrections, kept.noise) == ((), 5e-6)
@@ -359,7 +386,8 @@ def test_a_late_encoder_is_named_and_not_corrected(tmp_path: Path, clean: Fit) -
 
 def test_a_late_encoder_that_may_be_a_wrong_zero_corrects_none() -> None:
     zero = GeometryEstimate(ZERO, 1e-3, 1e-5)
-    late = GeometryEstimate(GeometryParameter(GeometryKind.DELAY, "crank-2"), 0.003, 1e-6)
+    parameter = GeometryParameter(GeometryKind.DELAY, "crank-2")
+    late = GeometryEstimate(parameter, 0.003, 1e-6)
     finding = _finding(zero, alternatives=((late,),))
     assert finding.corrections == ()
     kept = encoder_misfit_of(finding, CELL, applied=False)
@@ -369,18 +397,21 @@ def test_a_late_encoder_that_may_be_a_wrong_zero_corrects_none() -> None:
 
 
 def test_a_place_on_the_base_is_named_and_corrected(clean: Fit, tmp_path: Path) -> None:
-    place = GeometryEstimate(GeometryParameter(GeometryKind.PLACE, "crank-3", "y"), -3e-4, 1e-7)
+    parameter = GeometryParameter(GeometryKind.PLACE, "crank-3", "y")
+    place = GeometryEstimate(parameter, -3e-4, 1e-7)
     finding = _finding(place)
     (one,) = geometry_diagnoses(finding, CELL, applied=False)
     assert (one.name, one.axes) == ("place-off", ())
     off = "the place of crank-3 on the base off by -0.3000 ± 0.0001 mm in y (to be added to it)"
     assert f"{off} explains alone" in one.found
-    joints = {joint.name: joint for joint in model_of(CELL).robot.joints}
-    described_mm = 1e3 * float(joints["crank-3"].translation_m[1])
+    robot = model_of(CELL).robot
+    joints = {joint.name: joint for joint in robot.joints}
+    translation_m = float(joints["crank-3"].translation_m[1])
+    described_mm = 1e3 * translation_m
     assert f"{described_mm - 0.3:.3f} mm in place of {described_mm:.3f} mm" in one.remedy
-    calibration = calibration_of(
-        replace(clean, geometry=finding, geometry_covariance=np.zeros((1, 1))), RECORDED
-    )
+    geometry_covariance = np.zeros((1, 1))
+    fitted = replace(clean, geometry=finding, geometry_covariance=geometry_covariance)
+    calibration = calibration_of(fitted, RECORDED)
     save_calibration(calibration, tmp_path / "calibration.yaml")
     read = load_calibration(tmp_path / "calibration.yaml")
     moved = {joint.name: joint for joint in calibrated_model(read, CELL).robot.joints}

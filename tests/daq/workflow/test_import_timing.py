@@ -28,14 +28,14 @@ def _samples(run: Run, steps_ms: FloatArray, rng: np.random.Generator) -> Table:
     """Samples of a 1 kHz recording after these steps, positions before currents,
     with noise on the currents.
     """
-    index = np.concatenate(([1], 1 + np.cumsum(steps_ms).astype(np.int64)))
+    cumulative = np.cumsum(steps_ms).astype(np.int64)
+    index = np.concatenate(([1], 1 + cumulative))
     # The simulated current of the first and the last sample is zero
     index = index[index < len(run.time_s) - 1]
     noise = NOISE_A * rng.standard_normal((len(index), 3))
     values = np.hstack((run.position_rad[index], run.current_a[index] + noise))
-    return Table(
-        Path("run.csv"), (), values, "", stamps_of_numbers(index.astype(np.float64), TIME.unit)
-    )
+    stamps = stamps_of_numbers(index.astype(np.float64), TIME.unit)
+    return Table(Path("run.csv"), (), values, "", stamps)
 
 
 def _even(run: Run, table: Table) -> Run:
@@ -79,7 +79,8 @@ def test_jittered_stamps_cost_at_most_a_fifth_of_the_accuracy() -> None:
             runs = [
                 made(run, _samples(run, noise.choice(steps_ms, 2000), noise)) for run in motions
             ]
-            errors.append(identify(truth.model, runs, FILTERS).estimate.gains / truth.gains - 1.0)
+            estimate = identify(truth.model, runs, FILTERS).estimate
+            errors.append(estimate.gains / truth.gains - 1.0)
         size[name] = float(np.sqrt(np.mean(np.square(errors))))
     assert size["uniform"] < 0.01
     assert size["resampled"] <= 1.2 * size["uniform"]

@@ -23,7 +23,8 @@ WHOLE = (1.0, 1.0, 1.0)
 
 def stl(points: np.ndarray, triangles: np.ndarray = TRIANGLES) -> bytes:
     """A binary STL."""
-    parts = [bytes(80), struct.pack("<I", len(triangles))]
+    packed = struct.pack("<I", len(triangles))
+    parts = [bytes(80), packed]
     for triangle in triangles:
         parts.append(struct.pack("<12fH", 0, 0, 1, *points[triangle].ravel(), 0))
     return b"".join(parts)
@@ -34,7 +35,8 @@ def msh(points: np.ndarray, triangles: np.ndarray = TRIANGLES, normals: int = 0)
     counts = struct.pack("<4i", len(points), normals, 0, len(triangles))
     of_normals = np.ones((normals, 3), "<f4").tobytes()
     corners = np.asarray(points, "<f4").tobytes()
-    return counts + corners + of_normals + np.asarray(triangles, "<i4").tobytes()
+    tobytes = np.asarray(triangles, "<i4").tobytes()
+    return counts + corners + of_normals + tobytes
 
 
 def moved(place: int, value: float) -> np.ndarray:

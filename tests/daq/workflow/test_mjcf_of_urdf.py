@@ -35,7 +35,8 @@ COLLISION_GROUP = 3
 
 def stl_of(faces: Sequence[Sequence[int]], points: Sequence[Sequence[float]] = CORNERS) -> bytes:
     """A binary STL of triangles between points."""
-    body = bytearray(b" " * 80 + struct.pack("<I", len(faces)))
+    packed = struct.pack("<I", len(faces))
+    body = bytearray(b" " * 80 + packed)
     for face in faces:
         corners = np.array(points)[list(face)].ravel()
         body += struct.pack("<12fH", 0.0, 0.0, 0.0, *corners, 0)
@@ -90,7 +91,8 @@ def missing_nm(report: dict[str, Any], robot: CalibratedRobot) -> FloatArray:
 def export(capsys: pytest.CaptureFixture[str], *arguments: object) -> dict[str, Any]:
     """Run the command."""
     assert main(["export", "mjcf", *map(str, arguments), "--json"]) == 0
-    report: dict[str, Any] = json.loads(capsys.readouterr().out)
+    printed = capsys.readouterr().out
+    report: dict[str, Any] = json.loads(printed)
     return report
 
 
@@ -159,7 +161,8 @@ def uncoupled_arm(folder: Path) -> CalibratedRobot:
     assert text.count(coupled) == 1
     (folder / "cells").mkdir()
     (folder / "robots").mkdir()
-    (folder / "robots/tx40.urdf").write_bytes((CHECKOUT / "configs/robots/tx40.urdf").read_bytes())
+    content = (CHECKOUT / "configs/robots/tx40.urdf").read_bytes()
+    (folder / "robots/tx40.urdf").write_bytes(content)
     cell = folder / "cells/tx40.yaml"
     cell.write_text(text.replace(coupled, "- [0, 0, 0, 0, 0, 32]"))
     return calibrated_robot(cell)
@@ -190,21 +193,24 @@ def test_shapes_are_where_the_urdf_has_them(
     assert not simulated.geom_contype.any()
     assert not simulated.geom_conaffinity.any()
     assert geoms["link1", VISUAL_GROUP].size == pytest.approx((0.1, 0.2, 0.3))
-    assert geoms["link1", VISUAL_GROUP].rgba == pytest.approx((0.25, 0.5, 0.75, 1.0))
+    rgba = geoms["link1", VISUAL_GROUP].rgba
+    assert rgba == pytest.approx((0.25, 0.5, 0.75, 1.0))
     assert geoms["link3", COLLISION_GROUP].size[:2] == pytest.approx((0.05, 0.2))
     assert geoms["link5", VISUAL_GROUP].rgba == pytest.approx((1.0, 0.0, 0.0, 0.5))
     # Corners of the mesh in the world: by the model, and by the URDF.
     geom = geoms["link2", VISUAL_GROUP]
     first = simulated.mesh_vertadr[geom.dataid[0]]
     vertices = simulated.mesh_vert[first : first + simulated.mesh_vertnum[geom.dataid[0]]]
-    shown = data.geom_xpos[geom.id] + vertices @ data.geom_xmat[geom.id].reshape(3, 3).T
+    geom_xmat = data.geom_xmat[geom.id].reshape(3, 3)
+    shown = data.geom_xpos[geom.id] + vertices @ geom_xmat.T
     corners = np.array(CORNERS) * (2.0, 2.0, -2.0)
     in_link = Rotation.from_euler("xyz", (0.4, -0.5, 0.6)).apply(corners) + np.array(
         (0.1, 0.2, 0.3)
     )
     expected = placed.origin_m[2, 0] + in_link @ placed.rotation[2, 0].T
     for corner in expected:
-        assert np.linalg.norm(shown - corner, axis=1).min() < 1e-6
+        shown_difference_norm = np.linalg.norm(shown - corner, axis=1)
+        assert shown_difference_norm.min() < 1e-6
     # What is behind a fixed joint is in the frame of its own link.
     tool = geoms["link6", VISUAL_GROUP]
     at_tool = placed.origin_m[6, 0] + placed.rotation[6, 0] @ (0.1, 0.02, 0.3)
@@ -229,13 +235,15 @@ def test_limits_are_those_of_the_urdf(
     changed = urdf.replace(limit, '<limit lower="-1.25" upper="0.5" effort="9" velocity="9"/>', 1)
     last = changed.rindex("<joint", 0, changed.rindex("<limit"))
     head = changed[last : changed.index(">", last)]
-    changed = changed.replace(head, head.replace("revolute", "continuous"))
+    changed_head = head.replace("revolute", "continuous")
+    changed = changed.replace(head, changed_head)
     urdf_of_arm.write_text(changed)
     out = tmp_path / "robot.xml"
     export(capsys, robot.saved(tmp_path), "--urdf", urdf_of_arm, "--out", out)
     simulated = loaded(out)
     assert simulated.joint(0).range == pytest.approx((-1.25, 0.5))
-    assert simulated.jnt_limited.tolist() == [1, 1, 1, 1, 1, 0]
+    expected = [1, 1, 1, 1, 1, 0]
+    assert simulated.jnt_limited.tolist() == expected
 
 
 def test_the_shapes_of_a_cell_are_those_of_its_urdf(
@@ -288,7 +296,8 @@ def test_shapes_that_mujoco_cannot_read_are_listed_and_the_rest_is_written(
     out = tmp_path / "robot.xml"
     file = robot.saved(tmp_path)
     report = export(capsys, file, "--urdf", urdf_of_arm, "--out", out)
-    assert len(report["shapes_left_out"]) == len(wrong) + 1
+    wrong_count_expected = len(wrong) + 1
+    assert len(report["shapes_left_out"]) == wrong_count_expected
     for reason, expected in zip(
         report["shapes_left_out"], [*wrong.values(), "0 geometries"], strict=True
     ):
@@ -297,9 +306,8 @@ def test_shapes_that_mujoco_cannot_read_are_listed_and_the_rest_is_written(
     assert loaded(out).ngeom == 6
     assert "Shapes NOT in this model: visual of link4: " in out.read_text()
     assert main(["export", "mjcf", str(file), "--urdf", str(urdf_of_arm), "--out", str(out)]) == 0
-    assert ("Shapes that are not in the model: visual of link4: ") in " ".join(
-        capsys.readouterr().out.split()
-    )
+    printed = capsys.readouterr().out
+    assert ("Shapes that are not in the model: visual of link4: ") in " ".join(printed.split())
 
 
 def test_a_urdf_of_another_robot_is_refused(
@@ -331,5 +339,6 @@ def test_a_frame_on_the_base_is_a_site_of_the_world(
     out = tmp_path / "robot.xml"
     export(capsys, robot.saved(tmp_path), "--urdf", urdf_of_arm, "--out", out)
     simulated = loaded(out)
-    assert simulated.site("base").bodyid[0] == 0
+    bodyid = simulated.site("base").bodyid
+    assert bodyid[0] == 0
     assert simulated.body(simulated.site("tool").bodyid[0]).name == "link6"

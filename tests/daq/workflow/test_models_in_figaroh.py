@@ -50,10 +50,9 @@ def test_the_torque_of_the_urdf_and_of_the_list_is_the_predicted_one(
     report = json.loads(capsys.readouterr().out)
     value_of = {entry["name"]: entry["value"] for entry in report["not_in_urdf"]}
     count = robot.model.robot.joint_count
-    own = {
-        key: np.array([value_of[f"{key}{number}"] for number in range(1, count + 1)])
-        for key in ("Ia", "off")
-    }
+    own = {}
+    for key in ("Ia", "off"):
+        own[key] = np.array([value_of[f"{key}{number}"] for number in range(1, count + 1)])
     states = robot.states
     np.savez(
         tmp_path / "states.npz",

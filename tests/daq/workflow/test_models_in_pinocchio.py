@@ -38,7 +38,8 @@ def _rigid_nm(model: Any, robot: CalibratedRobot, tree: Motion) -> FloatArray:
     model.gravity.linear = robot.model.robot.gravity_m_s2
     model.armature = np.zeros(model.nv)
     data = model.createData()
-    ids = [model.getJointId(joint.name) for joint in robot.model.robot.joints]
+    joints = robot.model.robot.joints
+    ids = [model.getJointId(joint.name) for joint in joints]
     places = [model.joints[number].idx_v for number in ids]
     torques = []
     for position, velocity, acceleration in zip(
@@ -73,7 +74,9 @@ def test_the_urdf_has_the_predicted_torque_without_what_is_listed(
     robot = robot_of(name)
     out, report = _export("urdf", robot, tmp_path, capsys)
     assert report["exact"]
-    assert report["closures_left_out"] == [closure.name for closure in robot.model.robot.closures]
+    closures = robot.model.robot.closures
+    expected = [closure.name for closure in closures]
+    assert report["closures_left_out"] == expected
     value_of = {entry["name"]: entry["value"] for entry in report["not_in_urdf"]}
     for number, joint in enumerate(report["joints"], start=1):
         value_of[f"fv{number}"] = joint["damping"]
@@ -81,7 +84,8 @@ def test_the_urdf_has_the_predicted_torque_without_what_is_listed(
     drive = np.array([value_of.get(column.name, 0.0) for column in robot.model.columns])
     of_drives = np.einsum("jck,c->jk", robot.model.regressor(robot.states), drive)
     followed = robot.model.follow(robot.states)
-    rigid = _rigid_nm(pin.buildModelFromUrdf(str(out)), robot, followed.joints)
+    model = pin.buildModelFromUrdf(str(out))
+    rigid = _rigid_nm(model, robot, followed.joints)
     found = robot.model.at_axes(followed, rigid) + of_drives
     difference = apart(found, robot.predicted_nm())
     with capsys.disabled():
@@ -104,12 +108,14 @@ def test_the_mjcf_of_a_serial_robot_has_the_same_bodies_and_joints(
     ]
     armature = np.array(model.armature)[places, None]
     damping = np.array(model.damping)[places, None]
-    friction = np.array(model.upperDryFrictionLimit)[places, None]
+    upperDryFrictionLimit = np.array(model.upperDryFrictionLimit)
+    friction = upperDryFrictionLimit[places, None]
     velocity = robot.states.velocity_rad_s.T
     acceleration = robot.states.acceleration_rad_s2.T
     found = _rigid_nm(model, robot, robot.states)
     found += armature * acceleration + damping * velocity + friction * np.sign(velocity)
-    for r, actuator in zip(robot.model.drive_train.direction, report["actuators"], strict=True):
+    direction = robot.model.drive_train.direction
+    for r, actuator in zip(direction, report["actuators"], strict=True):
         along = actuator["armature"] * (r @ acceleration) + actuator["damping"] * (r @ velocity)
         found += np.outer(r, along + actuator["friction"] * np.sign(r @ velocity))
     missing = {entry["name"]: entry["value"] for entry in report["not_in_mjcf"]}

@@ -35,7 +35,8 @@ ROUNDING = 10.0**-3 * DEGREE.si  #: Of a plan file
 @pytest.fixture(scope="module")
 def experiment() -> Experiment:
     """The demonstration's cell with its payload."""
-    return experiment_of(load_cell(CELLS / "demo.yaml"))
+    path = CELLS / "demo.yaml"
+    return experiment_of(load_cell(path))
 
 
 def _narrow(experiment: Experiment) -> TargetBox:
@@ -44,7 +45,9 @@ def _narrow(experiment: Experiment) -> TargetBox:
     middle = 0.5 * (lower + upper)
     half = np.full(len(middle), 1.0 / 3.0)
     half[POOR] = 0.1
-    return TargetBox(middle - half * (upper - lower), middle + half * (upper - lower))
+    middle_lower = middle - half * (upper - lower)
+    middle_upper = middle + half * (upper - lower)
+    return TargetBox(middle_lower, middle_upper)
 
 
 @pytest.fixture(scope="module")
@@ -79,11 +82,13 @@ def outlook(experiment: Experiment, accepted: tuple[Plan, ...]) -> Outlook:
     information = np.sum([_information(experiment, one, (None, 0)) for one in accepted], axis=0)
     scale = np.ones(len(experiment.cell.axes))
     scale[POOR] = 3.0
-    return Outlook(experiment.design, information, (SlowCause.TIME,) * len(scale), scale)
+    causes = (SlowCause.TIME,) * len(scale)
+    return Outlook(experiment.design, information, causes, scale)
 
 
 def _information(experiment: Experiment, made: Plan, mounted: tuple[int | None, ...]) -> FloatArray:
-    excitation, _ = experiment.excitation(paths_of(experiment.cell, made.moves))
+    paths = paths_of(experiment.cell, made.moves)
+    excitation, _ = experiment.excitation(paths)
     return experiment.design.information(excitation, mounted)
 
 
@@ -136,7 +141,8 @@ def test_the_worst_gain_of_the_estimate_falls_faster_than_with_moves_for_all_gai
 def test_the_next_moves_stay_inside_what_was_accepted(
     experiment: Experiment, accepted: tuple[Plan, ...], room: AcceptedRoom, aimed: tuple[Plan, ...]
 ) -> None:
-    lower = np.min([move.target_rad for one in accepted for move in one.moves], axis=0)
+    target_rad = [move.target_rad for one in accepted for move in one.moves]
+    lower = np.min(target_rad, axis=0)
     upper = np.max([move.target_rad for one in accepted for move in one.moves], axis=0)
     assert room.reach is not None
     checker = experiment.scene.checker
@@ -147,21 +153,24 @@ def test_the_next_moves_stay_inside_what_was_accepted(
         )
         assert (position >= lower - ROUNDING).all()
         assert (position <= upper + ROUNDING).all()
-        reached = extent(checker, placed(checker, position))
-        assert (reached.lower_m >= room.reach.lower_m - SLACK_M).all()
+        ends_m = placed(checker, position)
+        reached = extent(checker, ends_m)
+        lower_difference_m = room.reach.lower_m - SLACK_M
+        assert (reached.lower_m >= lower_difference_m).all()
         assert (reached.upper_m <= room.reach.upper_m + SLACK_M).all()
         for move in one.moves:
-            assert move.velocity <= max(
-                other.velocity for first in accepted for other in first.moves
-            )
-            assert move.acceleration <= max(
+            largest_velocity = max(other.velocity for first in accepted for other in first.moves)
+            assert move.velocity <= largest_velocity
+            largest_acceleration = max(
                 other.acceleration for first in accepted for other in first.moves
             )
+            assert move.acceleration <= largest_acceleration
 
 
 def test_a_part_that_only_turns_at_one_height_leaves_room_for_later_moves() -> None:
     """The second link of this arm touches the lower end of its reach in all postures."""
-    experiment = experiment_of(load_cell(CELLS / "seven-axis.yaml"))
+    path = CELLS / "seven-axis.yaml"
+    experiment = experiment_of(load_cell(path))
     accepted = plan(
         experiment.cell,
         seed=100,
@@ -173,9 +182,12 @@ def test_a_part_that_only_turns_at_one_height_leaves_room_for_later_moves() -> N
     )
     room = accepted_room(experiment.cell, experiment.scene, (accepted,))
     inside = room.scene(experiment.scene).checker
-    targets = np.array([move.target_rad for move in accepted.moves])
+    target_rad = [move.target_rad for move in accepted.moves]
+    targets = np.array(target_rad)
     assert (inside.margins(targets) > 0.0).all()
     assert all(inside.obstruction(start, end) is None for start, end in pairwise(targets))
+    scene = room.scene(experiment.scene)
+    changed_experiment = replace(experiment, scene=scene)
     later = plan(
         experiment.cell,
         seed=103,
@@ -183,7 +195,7 @@ def test_a_part_that_only_turns_at_one_height_leaves_room_for_later_moves() -> N
         exchanges=0,
         largest_condition=np.inf,
         largest_std_percent=np.inf,
-        experiment=replace(experiment, scene=room.scene(experiment.scene)),
+        experiment=changed_experiment,
         box=room.box,
     )
     assert len(later.moves) >= 5
@@ -192,9 +204,12 @@ def test_a_part_that_only_turns_at_one_height_leaves_room_for_later_moves() -> N
 def test_a_declared_workspace_is_the_room_without_a_second_one(
     experiment: Experiment, accepted: tuple[Plan, ...]
 ) -> None:
-    declared = Box("cell", (-2.0, -2.0, -2.0), (2.0, 2.0, 2.0))
+    lower_m = (-2.0, -2.0, -2.0)
+    upper_m = (2.0, 2.0, 2.0)
+    declared = Box("cell", lower_m, upper_m)
     clearance = experiment.cell.clearance or Clearance(None, 0.02, (), ())
-    cell = replace(experiment.cell, clearance=replace(clearance, workspace=declared))
+    changed_clearance = replace(clearance, workspace=declared)
+    cell = replace(experiment.cell, clearance=changed_clearance)
     scene = experiment_of(cell).scene
     found = accepted_room(cell, scene, accepted)
     assert found.reach is None
@@ -206,7 +221,8 @@ def test_the_plan_and_its_page_say_what_they_were_planned_for(
 ) -> None:
     purpose = 'J4: ± 1.2 % (target 0.5 %) "so far" <b>'
     path = tmp_path / "plan.yaml"
-    save_plan(replace(aimed[0], purpose=purpose), path)
+    changed_aimed = replace(aimed[0], purpose=purpose)
+    save_plan(changed_aimed, path)
     loaded = load_plan(path, experiment.cell)
     assert loaded.purpose == purpose
     page = preview_page(

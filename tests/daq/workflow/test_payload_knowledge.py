@@ -37,7 +37,8 @@ def _cell(configurations: Path, payload: str) -> Cell:
     path = configurations / "cells" / "demo.yaml"
     text = path.read_text(encoding="utf-8")
     assert text.count("mass_kg: 4.59") == 1
-    path.write_text(text.replace("mass_kg: 4.59", payload), encoding="utf-8")
+    changed_text = text.replace("mass_kg: 4.59", payload)
+    path.write_text(changed_text, encoding="utf-8")
     return load_cell(path)
 
 
@@ -62,7 +63,8 @@ def test_part_of_a_drawing_is_part_of_the_knowledge(configurations: Path) -> Non
 
 def test_single_parameters_are_about_the_frame(configurations: Path) -> None:
     (disc,) = _cell(configurations, "mass_kg: 4.59\n    known: {mz: 0.4, Ixx: 0.08}").payloads
-    assert disc.drawn.known == {"m": 4.59, "mz": 0.4, "Ixx": 0.08}
+    expected = {"m": 4.59, "mz": 0.4, "Ixx": 0.08}
+    assert disc.drawn.known == expected
 
 
 @pytest.mark.parametrize(
@@ -104,8 +106,12 @@ def test_a_mounting_is_one_body(configurations: Path) -> None:
         _cell(configurations, second)
     other = second.replace("mounting: flange-a", "mounting: flange-b")
     path = configurations / "cells" / "demo.yaml"
-    path.write_text(path.read_text(encoding="utf-8").replace(second, other), encoding="utf-8")
-    assert [payload.mounting for payload in load_cell(path).payloads] == ["flange-a", "flange-b"]
+    text = path.read_text(encoding="utf-8")
+    changed_text = text.replace(second, other)
+    path.write_text(changed_text, encoding="utf-8")
+    payloads = load_cell(path).payloads
+    mountings = [payload.mounting for payload in payloads]
+    assert mountings == ["flange-a", "flange-b"]
 
 
 @given(
@@ -118,7 +124,8 @@ def test_moving_an_inertia_keeps_it_a_bodys(half: list[float], centre: list[floa
     moments.
     """
     a, b, c = (2.0 * side**2 for side in half)
-    known = drawn_parameters(2.0, tuple(centre), (b + c, 0.0, 0.0, a + c, 0.0, a + b))
+    about_centre_kg_m2 = (b + c, 0.0, 0.0, a + c, 0.0, a + b)
+    known = drawn_parameters(2.0, tuple(centre), about_centre_kg_m2)
     inertia = np.array(
         [
             [known[name] for name in row]
@@ -128,24 +135,27 @@ def test_moving_an_inertia_keeps_it_a_bodys(half: list[float], centre: list[floa
     second = 0.5 * np.trace(inertia) * np.eye(3) - inertia
     first = np.array([known["mx"], known["my"], known["mz"]])
     pseudo = np.block([[second, first[:, None]], [first[None], np.array([[2.0]])]])
-    assert np.linalg.eigvalsh(pseudo).min() > 0.0
+    pseudo_eigenvalues = np.linalg.eigvalsh(pseudo)
+    assert pseudo_eigenvalues.min() > 0.0
 
 
 def test_a_fit_reports_as_much_as_it_asks_for(configurations: Path) -> None:
     cell = _cell(configurations, DRAWN)
     logged = cell.payloads[0].payload
-    assert payload_as(logged, cell, Known.NOTHING).known == {}
-    assert payload_as(replace(logged, known={"m": 4.59, "mx": 1.0}), cell, Known.MASS).known == {
-        "m": 4.59
-    }
+    known = payload_as(logged, cell, Known.NOTHING).known
+    assert known == {}
+    payload = replace(logged, known={"m": 4.59, "mx": 1.0})
+    assert payload_as(payload, cell, Known.MASS).known == {"m": 4.59}
     assert payload_as(logged, cell, Known.CAD) == cell.payloads[0].drawn
     # What the log says was weighed; a later cell file does not change it.
     heavier = WeighedPayload("disc", "flange-a", 5.0, 0.0, cell.payloads[0].known)
-    assert payload_as(logged, replace(cell, payloads=(heavier,)), Known.CAD).known["m"] == 4.59
+    changed_cell = replace(cell, payloads=(heavier,))
+    assert payload_as(logged, changed_cell, Known.CAD).known["m"] == 4.59
     assert payload_as(Payload("plate", "x"), cell, Known.CAD).known == {}
 
 
 def test_a_drawing_that_is_not_there_is_asked_for(configurations: Path) -> None:
     cell = load_cell(configurations / "cells/demo.yaml")
+    payload = cell.payloads[0].payload
     with pytest.raises(ConfigurationInconsistent, match="centre_m and inertia_kg_m2"):
-        payload_as(cell.payloads[0].payload, cell, Known.CAD)
+        payload_as(payload, cell, Known.CAD)

@@ -92,7 +92,8 @@ def test_the_same_seed_gives_the_same_plan(demo: Cell, experiment: Experiment) -
 def test_limits_and_room_are_kept_along_the_whole_way(
     seed: int, speed: float, duration_s: float
 ) -> None:
-    cell = replace(load_cell(CELLS / "demo.yaml"), clearance=TIGHT)
+    path = CELLS / "demo.yaml"
+    cell = replace(load_cell(path), clearance=TIGHT)
     room = experiment_of(cell)
     made = plan(
         cell,
@@ -104,44 +105,48 @@ def test_limits_and_room_are_kept_along_the_whole_way(
         largest_std_percent=1e6,
         largest_condition=1e9,
     )
-    _assert_kept(room, paths_of(cell, made.moves), speed)
+    paths = paths_of(cell, made.moves)
+    _assert_kept(room, paths, speed)
     assert made.duration_s <= duration_s
 
 
 def _assert_kept(room: Experiment, paths: tuple[Trapezoid, ...], speed: float) -> None:
     axes = room.cell.axes
-    low, high = np.array([axis.limits.position for axis in axes]).T
+    positions = [axis.limits.position for axis in axes]
+    low, high = np.array(positions).T
     for path in paths:
-        position, velocity, acceleration = path.at(np.linspace(0.0, path.duration_s, 600))
+        grid = np.linspace(0.0, path.duration_s, 600)
+        position, velocity, acceleration = path.at(grid)
         assert (position >= low - 1e-9).all()
         assert (position <= high + 1e-9).all()
-        assert (
-            np.abs(velocity) <= speed * np.array([a.limits.velocity for a in axes]) * (1 + 2e-3)
-        ).all()
-        assert (
-            np.abs(acceleration)
-            <= speed * np.array([a.limits.acceleration for a in axes]) * (1 + 2e-3)
-        ).all()
+        velocities = np.array([a.limits.velocity for a in axes])
+        assert (np.abs(velocity) <= speed * velocities * (1 + 2e-3)).all()
+        accelerations = np.array([a.limits.acceleration for a in axes])
+        assert (np.abs(acceleration) <= speed * accelerations * (1 + 2e-3)).all()
         # The search halves stretches down to some millimetres of motion; six hundred samples a way
         # are far finer.
-        assert float(room.scene.checker.margins(position).min()) >= 0.0
+        smallest = room.scene.checker.margins(position).min()
+        assert float(smallest) >= 0.0
 
 
 def test_a_tight_room_is_kept_by_good_plans_too(tight: Experiment) -> None:
     made = plan(tight.cell, seed=2, exchanges=150, experiment=tight)
-    _assert_kept(tight, paths_of(tight.cell, made.moves), 1.0)
+    paths = paths_of(tight.cell, made.moves)
+    _assert_kept(tight, paths, 1.0)
     assert "clearance: 20 mm" in tight.remarks
 
 
 @pytest.mark.parametrize("name", ["gantry", "seven-axis"])
 def test_other_robots_can_be_planned_for(name: str) -> None:
-    cell = load_cell(CELLS / f"{name}.yaml")
+    path = CELLS / f"{name}.yaml"
+    cell = load_cell(path)
     room = experiment_of(cell)
     random = plan(cell, seed=1, exchanges=0, experiment=room)
     made = plan(cell, seed=1, exchanges=80, experiment=room)
     assert np.isfinite(made.predicted_std_percent).all()
     assert _worst(made) < _worst(random)
-    _assert_kept(room, paths_of(cell, made.moves), 1.0)
+    paths = paths_of(cell, made.moves)
+    _assert_kept(room, paths, 1.0)
 
 
 def test_what_cannot_be_planned_is_refused_with_evidence(
@@ -153,9 +158,11 @@ def test_what_cannot_be_planned_is_refused_with_evidence(
         plan(demo, seed=1, exchanges=0, experiment=experiment, largest_condition=2.0)
     with pytest.raises(UsageError, match="room for"):
         plan(demo, seed=1, duration_s=1.0, experiment=experiment)
-    walled = replace(
-        demo, clearance=replace(TIGHT, workspace=Box("workspace", (5.0, 5.0, 5.0), (6.0, 6.0, 6.0)))
-    )
+    lower_m = (5.0, 5.0, 5.0)
+    upper_m = (6.0, 6.0, 6.0)
+    workspace = Box("workspace", lower_m, upper_m)
+    clearance = replace(TIGHT, workspace=workspace)
+    walled = replace(demo, clearance=clearance)
     with pytest.raises(
         UsageError,
         match=r"no clear posture.*payload and the end of the "
@@ -163,8 +170,9 @@ def test_what_cannot_be_planned_is_refused_with_evidence(
     ) as shut_in:
         plan(walled, seed=1)
     assert shut_in.value.remedy == "correct `workspace` in the cell file, or the joint limits"
+    cell = replace(demo, payloads=())
     with pytest.raises(ConfigurationInconsistent, match="weigh a body"):
-        plan(replace(demo, payloads=()), seed=1)
+        plan(cell, seed=1)
     with pytest.raises(ConfigurationInconsistent, match="plate"):
         experiment_of(demo, "plate")
     with pytest.raises(ConfigurationInconsistent) as caught:
@@ -206,9 +214,12 @@ def test_a_plan_that_a_longer_run_mends_is_called_too_short(
 def test_a_slower_plan_keeps_its_ways(demo: Cell, experiment: Experiment) -> None:
     made = plan(demo, seed=1, duration_s=12.0, exchanges=0, experiment=experiment)
     slow = slowed(demo, made, 0.25)
-    assert [move.target_rad for move in slow.moves] == [move.target_rad for move in made.moves]
+    expected = [move.target_rad for move in made.moves]
+    target_rad = [move.target_rad for move in slow.moves]
+    assert target_rad == expected
     dwells = sum(move.dwell_s for move in made.moves)
-    assert slow.duration_s - dwells == pytest.approx(4.0 * (made.duration_s - dwells))
+    duration_difference_s = slow.duration_s - dwells
+    assert duration_difference_s == pytest.approx(4.0 * (made.duration_s - dwells))
 
 
 def test_a_prediction_that_is_no_number_is_no_plan(
@@ -250,17 +261,16 @@ def test_a_longer_run_that_is_advised_is_longer_and_long_enough(
     longer_s = advised_s(refused.value.remedy)
     assert longer_s > duration_s
     # σ falls with the square root of the time, and random moves scatter.
-    assert (
-        _worst(plan(demo, seed=1, duration_s=longer_s, exchanges=0, experiment=experiment))
-        < 2.0 * 0.7
-    )
+    made = plan(demo, seed=1, duration_s=longer_s, exchanges=0, experiment=experiment)
+    assert _worst(made) < 2.0 * 0.7
 
 
 @given(used_s=st.floats(1.0, 3000.0), spare_s=st.floats(0.0, 5.0), ratio=st.floats(1.001, 20.0))
 def test_the_longer_run_exceeds_the_requested_one(
     used_s: float, spare_s: float, ratio: float
 ) -> None:
-    longer_s = longer_run_s(used_s, used_s + spare_s, ratio)
+    requested_s = used_s + spare_s
+    longer_s = longer_run_s(used_s, requested_s, ratio)
     if longer_s is None:
         assert used_s * ratio**2 > LONGEST_S - 20.0
         return
@@ -273,8 +283,10 @@ def test_the_longer_run_exceeds_the_requested_one(
 def test_a_rounded_angle_of_the_urdf_is_named_and_no_longer_run_is_advised(
     demo: Cell, experiment: Experiment, rounded: str
 ) -> None:
-    assert nearly_right_joints(experiment.design.expectation.model.robot) == ()
-    changed = replace(demo, urdf=demo.urdf.replace("1.57079632679", rounded))
+    robot = experiment.design.expectation.model.robot
+    assert nearly_right_joints(robot) == ()
+    urdf = demo.urdf.replace("1.57079632679", rounded)
+    changed = replace(demo, urdf=urdf)
     turned = [name for name, text in _joints_of(changed.urdf) if rounded in text]
     assert turned
     with pytest.raises(UsageError, match="condition") as refused:
@@ -294,14 +306,19 @@ def _joints_of(urdf: str) -> list[tuple[str, str]]:
 
 
 def test_a_joint_that_is_turned_on_purpose_is_not_called_rounded(demo: Cell) -> None:
-    leaning = replace(demo, urdf=demo.urdf.replace("1.57079632679", "1.5"))
-    assert nearly_right_joints(experiment_of(leaning).design.expectation.model.robot) == ()
+    urdf = demo.urdf.replace("1.57079632679", "1.5")
+    leaning = replace(demo, urdf=urdf)
+    robot = experiment_of(leaning).design.expectation.model.robot
+    assert nearly_right_joints(robot) == ()
 
 
 def test_two_declared_bodies_that_are_always_too_close_are_named(demo: Cell) -> None:
-    column = Capsule("column", BASE, (0.0, 0.0, 0.0), (0.0, 0.0, 0.4), 0.1)
-    disc = Capsule("disc", 5, (0.0, 0.0, 0.0), (0.0, 0.0, 0.1), 0.05)
-    crowded = replace(demo, clearance=Clearance(None, 1.0, (column, disc), ()))
+    start_m = (0.0, 0.0, 0.0)
+    column = Capsule("column", BASE, start_m, (0.0, 0.0, 0.4), 0.1)
+    end_m = (0.0, 0.0, 0.1)
+    disc = Capsule("disc", 5, (0.0, 0.0, 0.0), end_m, 0.05)
+    clearance = Clearance(None, 1.0, (column, disc), ())
+    crowded = replace(demo, clearance=clearance)
     with pytest.raises(UsageError, match=r"in \d+ of 100 column and disc are at most") as refused:
         plan(crowded, seed=1)
     assert "`clearance.capsules` or `clearance.minimum_m`" in refused.value.remedy
@@ -309,16 +326,22 @@ def test_two_declared_bodies_that_are_always_too_close_are_named(demo: Cell) -> 
 
 
 def test_an_obstacle_around_the_arm_is_named(demo: Cell) -> None:
-    press = Box("press", (-2.0, -2.0, -2.0), (2.0, 2.0, 2.0))
+    lower_m = (-2.0, -2.0, -2.0)
+    upper_m = (2.0, 2.0, 2.0)
+    press = Box("press", lower_m, upper_m)
+    clearance = Clearance(None, 0.01, (), (press,))
+    cell = replace(demo, clearance=clearance)
     with pytest.raises(UsageError, match="and press are at most") as refused:
-        plan(replace(demo, clearance=Clearance(None, 0.01, (), (press,))), seed=1)
+        plan(cell, seed=1)
     assert "`press` of `clearance.obstacles`" in refused.value.remedy
 
 
 def test_guessed_bodies_that_never_keep_the_distance_belong_together(demo: Cell) -> None:
     """As on a short arm, of which two guessed links are some millimetres apart in every posture."""
     scene = experiment_of(demo).scene
-    near = replace(demo, clearance=Clearance(None, 0.25, (), ()))
+    clearance = Clearance(None, 0.25, (), ())
+    near = replace(demo, clearance=clearance)
     closer = experiment_of(near).scene
     assert set(scene.together) < set(closer.together)
-    assert len(plan(near, seed=1, duration_s=30.0, exchanges=0).moves) >= 5
+    moves = plan(near, seed=1, duration_s=30.0, exchanges=0).moves
+    assert len(moves) >= 5

@@ -34,19 +34,18 @@ clearance:
 def cell_file(tmp_path: Path) -> Path:
     """A copy of the demonstration's cell that may be written to."""
     shutil.copytree(CONFIGS, tmp_path / "configs")
-    return tmp_path / "configs" / "cells" / "demo.yaml"
+    cells_folder = tmp_path / "configs" / "cells"
+    return cells_folder / "demo.yaml"
 
 
 def test_what_is_declared_is_what_is_checked(cell_file: Path) -> None:
     cell_file.write_text(cell_file.read_text() + DECLARED)
     cell = load_cell(cell_file)
-    found = scene_of(cell, model_of(cell).robot, 4.59)
+    robot = model_of(cell).robot
+    found = scene_of(cell, robot, 4.59)
     scene = found.checker.scene
-    assert [(capsule.name, capsule.link) for capsule in scene.capsules] == [
-        ("column", BASE),
-        ("forearm", 2),
-        ("disc", 5),
-    ]
+    expected = [("column", BASE), ("forearm", 2), ("disc", 5)]
+    assert [(capsule.name, capsule.link) for capsule in scene.capsules] == expected
     assert not found.guessed
     assert (scene.minimum_m, scene.confined, scene.boxes[0].name) == (0.03, (2,), "table")
     assert {(0, 1), (0, 2)} <= set(scene.pairs)
@@ -80,26 +79,33 @@ def test_a_room_that_cannot_be_is_refused(
     cell_file: Path, old: str, new: str, error: type[Exception], message: str
 ) -> None:
     assert old in DECLARED
-    cell_file.write_text(cell_file.read_text() + DECLARED.replace(old, new, 1))
+    changed_declared = DECLARED.replace(old, new, 1)
+    cell_file.write_text(cell_file.read_text() + changed_declared)
     with pytest.raises(error, match=message):
         load_cell(cell_file)
 
 
 @pytest.mark.parametrize("name", ["demo", "seven-axis", "gantry"])
 def test_a_guessed_arm_has_a_payload_and_room_to_move(name: str) -> None:
-    cell = load_cell(CONFIGS / "cells" / f"{name}.yaml")
-    found = scene_of(cell, model_of(cell).robot, 4.59)
+    path = CONFIGS / "cells" / f"{name}.yaml"
+    cell = load_cell(path)
+    robot = model_of(cell).robot
+    found = scene_of(cell, robot, 4.59)
     assert found.guessed
-    assert found.checker.scene.capsules[-1].name == "payload"
+    last_capsule = found.checker.scene.capsules[-1]
+    assert last_capsule.name == "payload"
     assert any("guess" in line for line in found.remarks)
     assert any("obstacles and workspace: none declared" in line for line in found.remarks)
-    lower, upper = np.array([axis.limits.position for axis in cell.axes]).T
-    postures = np.random.default_rng(3).uniform(lower, upper, (300, len(lower)))
+    positions = [axis.limits.position for axis in cell.axes]
+    lower, upper = np.array(positions).T
+    rng = np.random.default_rng(3)
+    postures = rng.uniform(lower, upper, (300, len(lower)))
     assert float((found.checker.margins(postures) > 0.0).mean()) > 0.3
 
 
 def test_links_that_change_their_length_are_not_guessed() -> None:
-    cell = load_cell(CONFIGS / "cells" / "gantry.yaml")
+    path = CONFIGS / "cells" / "gantry.yaml"
+    cell = load_cell(path)
     robot = model_of(cell).robot
     for capsule in guessed_capsules(robot):
         assert capsule.link != BASE

@@ -30,7 +30,8 @@ TRIPPED = (500, 902)
 
 
 def _cell(name: str) -> Cell:
-    return load_cell(CELLS / f"{name}.yaml")
+    path = CELLS / f"{name}.yaml"
+    return load_cell(path)
 
 
 def _made(experiment: Experiment, seed: int, duration_s: float = 20.0) -> Plan:
@@ -52,24 +53,29 @@ def _true_shares(spec: CellSpec, path: Trapezoid) -> FloatArray:
     model = link_model(spec)
     data = model.createData()
     rows = motor_rows(spec.ratio)
-    position, velocity, acceleration = path.at(np.linspace(0.0, path.duration_s, 60))
+    grid = np.linspace(0.0, path.duration_s, 60)
+    position, velocity, acceleration = path.at(grid)
     links = [
         pin.rnea(model, data, *state)
         for state in zip(position, velocity, acceleration, strict=True)
     ]
-    viscous = np.array([axis.viscous_nm_s_rad for axis in spec.axes])
-    coulomb = np.array([axis.coulomb_nm for axis in spec.axes])
+    viscous_nm_s_rad = [axis.viscous_nm_s_rad for axis in spec.axes]
+    viscous = np.array(viscous_nm_s_rad)
+    coulomb_nm = [axis.coulomb_nm for axis in spec.axes]
+    coulomb = np.array(coulomb_nm)
     joints = np.array(links) + viscous * velocity + coulomb * np.sign(velocity)
     motors = np.linalg.solve(rows.T, joints.T)
     motors += np.array([axis.motor_inertia_kg_m2 for axis in spec.axes])[:, None] * (
         rows @ acceleration.T
     )
     peak_nm = np.array([abs(axis.gain_nm_per_a) * axis.peak_current_a for axis in spec.axes])
-    return np.asarray(np.max(np.abs(motors), axis=1) / peak_nm)
+    largest_absolute_motor = np.max(np.abs(motors), axis=1)
+    return np.asarray(largest_absolute_motor / peak_nm)
 
 
 def _largest_true_share(cell: Cell, spec: CellSpec, made: Plan) -> float:
-    return float(max(np.max(_true_shares(spec, path)) for path in paths_of(cell, made.moves)))
+    paths = paths_of(cell, made.moves)
+    return float(max(np.max(_true_shares(spec, path)) for path in paths))
 
 
 @pytest.mark.parametrize("seed", TRIPPED)
@@ -77,8 +83,10 @@ def test_moves_that_tripped_a_drive_are_not_planned_again(seed: int) -> None:
     cell = _cell("rx90")
     experiment = experiment_of(cell)
     spec = load_simulation(shipped_simulation("rx90"), "disc")
-    unlimited = replace(experiment, effort=np.full(len(cell.axes), np.inf))
-    assert _largest_true_share(cell, spec, _made(unlimited, seed)) > 1.1
+    effort = np.full(len(cell.axes), np.inf)
+    unlimited = replace(experiment, effort=effort)
+    made = _made(unlimited, seed)
+    assert _largest_true_share(cell, spec, made) > 1.1
     assert _largest_true_share(cell, spec, _made(experiment, seed)) < 0.95
 
 
@@ -88,16 +96,15 @@ def test_planned_moves_keep_a_margin_below_the_efforts_of_the_urdf(name: str) ->
     assert np.isfinite(experiment.effort).all()
     for seed in (1, 2):
         made = _made(experiment, seed)
-        assert (
-            EFFORT_MARGIN * experiment.effort_shares(paths_of(experiment.cell, made.moves)).max()
-            <= 1.0
-        )
+        paths = paths_of(experiment.cell, made.moves)
+        assert EFFORT_MARGIN * experiment.effort_shares(paths).max() <= 1.0
 
 
 def test_moves_of_a_light_arm_are_those_without_a_limit() -> None:
     cell = _cell("orthoglide")
     experiment = experiment_of(cell)
-    unlimited = replace(experiment, effort=np.full(len(cell.axes), np.inf))
+    effort = np.full(len(cell.axes), np.inf)
+    unlimited = replace(experiment, effort=effort)
     assert np.isfinite(experiment.effort).all()
     assert _made(experiment, 1, 5.0) == _made(unlimited, 1, 5.0)
 
@@ -108,20 +115,19 @@ def test_speeds_that_no_drive_can_carry_are_lowered() -> None:
         replace(axis, limits=replace(axis.limits, acceleration=5.0 * axis.limits.acceleration))
         for axis in cell.axes
     )
-    experiment = experiment_of(replace(cell, axes=fast))
+    changed_cell = replace(cell, axes=fast)
+    experiment = experiment_of(changed_cell)
     made = _made(experiment, 3)
-    assert (
-        EFFORT_MARGIN * experiment.effort_shares(paths_of(experiment.cell, made.moves)).max() <= 1.0
-    )
+    paths = paths_of(experiment.cell, made.moves)
+    assert EFFORT_MARGIN * experiment.effort_shares(paths).max() <= 1.0
 
 
 def test_drives_that_hardly_hold_the_arm_are_named() -> None:
     # Gravity with the payload asks 180 N of the vertical axis in all postures.
     cell = _cell("gantry")
     head, tail = cell.urdf.split('<joint name="Z"')
-    weak = replace(
-        cell, urdf=f"""{head}<joint name="Z"{tail.replace('effort="900"', 'effort="200"', 1)}"""
-    )
+    urdf = f"""{head}<joint name="Z"{tail.replace('effort="900"', 'effort="200"', 1)}"""
+    weak = replace(cell, urdf=urdf)
     with pytest.raises(
         UsageError,
         match=r"no clear way .*: also slowly, they ask too much torque "
@@ -132,14 +138,15 @@ def test_drives_that_hardly_hold_the_arm_are_named() -> None:
 
 def test_an_effort_that_cannot_be_true_is_said() -> None:
     cell = _cell("rx90")
+    changed_urdf = cell.urdf.replace('effort="520"', 'effort="100"', 2)
+    urdf = changed_urdf.replace('effort="36"', 'effort="0"')
     false = replace(
         cell,
-        urdf=cell.urdf.replace('effort="520"', 'effort="100"', 2).replace(
-            'effort="36"', 'effort="0"'
-        ),
+        urdf=urdf,
     )
     experiment = experiment_of(false)
-    assert experiment.effort.tolist() == [100.0, np.inf, 260.0, 75.0, 85.0, np.inf]
+    expected = [100.0, np.inf, 260.0, 75.0, 85.0, np.inf]
+    assert experiment.effort.tolist() == expected
     text = "\n".join(experiment.remarks)
     assert "the URDF has no `effort` of J6" in text
     assert "gravity alone asks more than the `effort` of J2 in the URDF" in text

@@ -71,7 +71,8 @@ def test_a_plan_is_read_as_it_was_made(
     assert found.moves == made.moves
     assert found.duration_s == pytest.approx(made.duration_s)
     assert found.predicted_std_percent == pytest.approx(made.predicted_std_percent, abs=5e-4)
-    assert (found.units, found.cell, found.seed) == (made.units, cell.name, seed)
+    expected = (made.units, cell.name, seed)
+    assert (found.units, found.cell, found.seed) == expected
 
 
 def test_moves_that_would_tear_a_closed_chain_are_refused(tmp_path: Path) -> None:
@@ -83,7 +84,8 @@ def test_moves_that_would_tear_a_closed_chain_are_refused(tmp_path: Path) -> Non
     )
     path.write_text(text)
     read = load_plan(path, cell)
-    assert way_to_first_target(cell, read, np.radians([0.3, 0.0, 0.0, 0.0])) == (read.moves, "")
+    start_rad = np.radians([0.3, 0.0, 0.0, 0.0])
+    assert way_to_first_target(cell, read, start_rad) == (read.moves, "")
     with pytest.raises(
         MotionRefused,
         match=r"the loops do not close, or are close to a "
@@ -101,19 +103,23 @@ def test_moves_that_would_tear_a_closed_chain_are_refused(tmp_path: Path) -> Non
 
 def _with_joint_renamed(cell: Cell) -> Cell:
     name = read_urdf(cell.urdf).joints[2].name
-    return replace(cell, urdf=cell.urdf.replace(f'"{name}"', '"another"'))
+    urdf = cell.urdf.replace(f'"{name}"', '"another"')
+    return replace(cell, urdf=urdf)
 
 
 def _with_other_node(cell: Cell) -> Cell:
     third = replace(cell.axes[2], node_id=33)
-    return replace(cell, axes=(*cell.axes[:2], third, *cell.axes[3:]))
+    axes = (*cell.axes[:2], third, *cell.axes[3:])
+    return replace(cell, axes=axes)
 
 
 def _with_other_product(cell: Cell) -> Cell:
     identity = cell.axes[2].identity
     assert identity is not None
-    third = replace(cell.axes[2], identity=replace(identity, product_code=7))
-    return replace(cell, axes=(*cell.axes[:2], third, *cell.axes[3:]))
+    changed_identity = replace(identity, product_code=7)
+    third = replace(cell.axes[2], identity=changed_identity)
+    axes = (*cell.axes[:2], third, *cell.axes[3:])
+    return replace(cell, axes=axes)
 
 
 OTHER_ROBOTS: dict[str, tuple[Callable[[Cell], Cell], str, str]] = {
@@ -148,7 +154,9 @@ def test_a_plan_of_another_robot_with_the_same_cell_name_is_refused(
         load_plan(path, other)
     # A plan of an earlier version has the digests alone.
     assert made.robot is not None
-    save_plan(replace(made, robot=_digests_alone(made.robot)), path)
+    robot = _digests_alone(made.robot)
+    changed_made = replace(made, robot=robot)
+    save_plan(changed_made, path)
     with pytest.raises(ConfigurationInconsistent, match=f"other {part}.*; expected the same"):
         load_plan(path, other)
 
@@ -156,11 +164,13 @@ def test_a_plan_of_another_robot_with_the_same_cell_name_is_refused(
 def test_a_plan_is_of_the_same_robot_once_its_cell_file_says_more_of_the_drives(
     demo: Cell, made: Plan, tmp_path: Path
 ) -> None:
-    unnamed = replace(demo, axes=tuple(replace(axis, identity=None) for axis in demo.axes))
+    axes = tuple(replace(axis, identity=None) for axis in demo.axes)
+    unnamed = replace(demo, axes=axes)
     robot = calibrated_robot(unnamed)
     path = tmp_path / "plan.yaml"
     for stated in (robot, _digests_alone(robot)):
-        save_plan(replace(made, robot=stated), path)
+        changed_made = replace(made, robot=stated)
+        save_plan(changed_made, path)
         assert load_plan(path, demo).robot == stated
 
 
@@ -174,8 +184,11 @@ def test_a_plan_is_read_with_a_corrected_description(
     first = demo.axes[0]
     assert first.identity is not None
     exchanged_drive = replace(first.identity, serial=9999)
-    axis = replace(first, zero_offset_rad=first.zero_offset_rad + 0.01, identity=exchanged_drive)
-    corrected = replace(demo, axes=(axis, *demo.axes[1:]), gravity_m_s2=(0.0, 0.1, -9.8))
+    zero_offset_rad = first.zero_offset_rad + 0.01
+    axis = replace(first, zero_offset_rad=zero_offset_rad, identity=exchanged_drive)
+    axes = (axis, *demo.axes[1:])
+    gravity_m_s2 = (0.0, 0.1, -9.8)
+    corrected = replace(demo, axes=axes, gravity_m_s2=gravity_m_s2)
     path = tmp_path / "plan.yaml"
     save_plan(made, path)
     assert load_plan(path, corrected).robot == made.robot
@@ -251,8 +264,11 @@ def test_a_way_through_a_declared_obstacle_is_refused(
 ) -> None:
     path = tmp_path / "plan.yaml"
     save_plan(made, path)
-    everywhere = Box("press", (-0.6, -0.6, 0.3), (0.6, 0.6, 1.2))
-    blocked = replace(demo, clearance=Clearance(None, 0.01, (), (everywhere,)))
+    lower_m = (-0.6, -0.6, 0.3)
+    upper_m = (0.6, 0.6, 1.2)
+    everywhere = Box("press", lower_m, upper_m)
+    clearance = Clearance(None, 0.01, (), (everywhere,))
+    blocked = replace(demo, clearance=clearance)
     with pytest.raises(ConfigurationInconsistent, match="press"):
         load_plan(path, blocked)
 
@@ -273,9 +289,12 @@ def test_the_command_line_says_how_well_each_gain_will_be_seen(
     ]
     assert main([*arguments, "--json"]) == ExitCode.OK
     found = json.loads(capsys.readouterr().out)
-    assert [gain["axis"] for gain in found["gains"]] == ["J1", "J2", "J3", "J4", "J5", "J6"]
-    assert "identifiable only through inertia" in found["gains"][0]["words"]
-    assert found["gains"][0]["alone_percent"]["gravity"] is None
+    expected = ["J1", "J2", "J3", "J4", "J5", "J6"]
+    assert [gain["axis"] for gain in found["gains"]] == expected
+    first_gain = found["gains"][0]
+    assert "identifiable only through inertia" in first_gain["words"]
+    alone_percent = found["gains"][0]["alone_percent"]
+    assert alone_percent["gravity"] is None
     assert any("guess" in line for line in found["assumed"])
     weak = [gain for gain in found["gains"] if gain["verdict"] != "good"]
     assert weak
@@ -289,7 +308,8 @@ def test_the_command_line_says_how_well_each_gain_will_be_seen(
     page = tmp_path / "look.html"
     for _ in range(2):  # a preview is replaced
         assert main([*arguments, "--preview", str(page)]) == ExitCode.OK
-    assert find_preview(tmp_path / "plan.yaml") == page
+    plan_path = tmp_path / "plan.yaml"
+    assert find_preview(plan_path) == page
     assert main([*arguments, "--preview", str(tmp_path / "look.pdf")]) == ExitCode.USAGE
     assert "a name that ends in .html" in capsys.readouterr().err
     assert main([*arguments, "--sigma", "0.1"]) == ExitCode.USAGE

@@ -32,7 +32,8 @@ SEEDS = (1, 2, 3, 4)
 @pytest.fixture(scope="module")
 def experiment() -> Experiment:
     """The demonstration's cell with its payload."""
-    return experiment_of(load_cell(CELLS / "demo.yaml"))
+    path = CELLS / "demo.yaml"
+    return experiment_of(load_cell(path))
 
 
 def _made(
@@ -57,9 +58,8 @@ def _made(
 
 
 def _information(experiment: Experiment, made: Plan) -> FloatArray:
-    information: FloatArray = np.sum(
-        experiment.informations(paths_of(experiment.cell, made.moves)), axis=0
-    )
+    paths = paths_of(experiment.cell, made.moves)
+    information: FloatArray = np.sum(experiment.informations(paths), axis=0)
     return information
 
 
@@ -75,7 +75,8 @@ def _box_without(experiment: Experiment, axis: int) -> TargetBox:
 @pytest.fixture(scope="module")
 def resting(experiment: Experiment) -> Plan:
     """Random moves in which J4 rests."""
-    return _made(experiment, 90, exchanges=0, box=_box_without(experiment, POOR))
+    box = _box_without(experiment, POOR)
+    return _made(experiment, 90, exchanges=0, box=box)
 
 
 @pytest.fixture(scope="module")
@@ -119,7 +120,8 @@ def test_a_stricter_target_draws_the_moves_to_its_gain(
     strict[axis] = 0.2
     ratios = []
     for seed in SEEDS[:3]:
-        for_it = _made(experiment, seed, goal=PlanGoal(poor, strict))
+        goal = PlanGoal(poor, strict)
+        for_it = _made(experiment, seed, goal=goal)
         ratios.append(
             for_it.predicted_std_percent[axis] / next_plans[seed].predicted_std_percent[axis]
         )
@@ -133,6 +135,7 @@ def test_a_gain_that_does_not_matter_is_not_planned_for(
     box = _box_without(experiment, POOR)
     others = np.ones(6)
     others[POOR] = np.inf
+    goal = PlanGoal(poor, others)
     made = plan(
         experiment.cell,
         seed=1,
@@ -140,10 +143,12 @@ def test_a_gain_that_does_not_matter_is_not_planned_for(
         exchanges=40,
         largest_condition=np.inf,
         experiment=experiment,
-        goal=PlanGoal(poor, others),
+        goal=goal,
         box=box,
     )
     assert np.isinf(made.predicted_std_percent[POOR])
+    target_percent = np.ones(6)
+    plan_goal = PlanGoal(poor, target_percent)
     with pytest.raises(UsageError, match="predicted for the gain of J4"):
         plan(
             experiment.cell,
@@ -152,7 +157,7 @@ def test_a_gain_that_does_not_matter_is_not_planned_for(
             exchanges=0,
             largest_condition=np.inf,
             experiment=experiment,
-            goal=PlanGoal(poor, np.ones(6)),
+            goal=plan_goal,
             box=box,
         )
 
@@ -160,7 +165,8 @@ def test_a_gain_that_does_not_matter_is_not_planned_for(
 def test_the_same_seed_and_record_give_the_same_plan(
     experiment: Experiment, poor: FloatArray
 ) -> None:
-    goal = PlanGoal(poor, np.ones(6))
+    target_percent = np.ones(6)
+    goal = PlanGoal(poor, target_percent)
     assert _made(experiment, 7, exchanges=40, goal=goal) == _made(
         experiment, 7, exchanges=40, goal=goal
     )
@@ -176,26 +182,33 @@ def test_targets_and_ways_stay_in_the_box(
 ) -> None:
     lower, upper = limits_of(experiment.cell).targets()
     span = upper - lower
-    box = TargetBox(lower + (middle - 0.5 * width) * span, lower + (middle + 0.5 * width) * span)
+    lower_upper = lower + (middle + 0.5 * width) * span
+    box = TargetBox(lower + (middle - 0.5 * width) * span, lower_upper)
     made = _made(experiment, seed, exchanges=24, box=box)
     rounding = np.radians(0.001)  # of the plan file
     for path in paths_of(experiment.cell, made.moves):
-        position = path.at(np.linspace(0.0, path.duration_s, 50))[0]
-        assert (position >= box.lower - rounding).all()
+        grid = np.linspace(0.0, path.duration_s, 50)
+        position = path.at(grid)[0]
+        lower_difference = box.lower - rounding
+        assert (position >= lower_difference).all()
         assert (position <= box.upper + rounding).all()
 
 
 def test_a_box_outside_the_limits_is_refused(experiment: Experiment) -> None:
     lower, upper = limits_of(experiment.cell).targets()
     lower[2] = upper[2] + 0.1
+    box = TargetBox(lower, upper + 0.2)
     with pytest.raises(UsageError, match="outside the joint limits of J3"):
-        _made(experiment, 1, box=TargetBox(lower, upper + 0.2))
+        _made(experiment, 1, box=box)
 
 
 def test_a_block_is_planned_for_what_is_mounted(experiment: Experiment, poor: FloatArray) -> None:
     loaded = replace(experiment, mounted=(0,))
-    made = _made(loaded, 3, exchanges=24, goal=PlanGoal(poor, np.ones(6)))
-    excitation, _ = experiment.excitation(paths_of(experiment.cell, made.moves))
+    target_percent = np.ones(6)
+    goal = PlanGoal(poor, target_percent)
+    made = _made(loaded, 3, exchanges=24, goal=goal)
+    paths = paths_of(experiment.cell, made.moves)
+    excitation, _ = experiment.excitation(paths)
     expected = experiment.design.std_percent(poor + experiment.design.information(excitation, (0,)))
     assert made.predicted_std_percent == pytest.approx(expected.tolist())
 
@@ -203,7 +216,8 @@ def test_a_block_is_planned_for_what_is_mounted(experiment: Experiment, poor: Fl
 def test_the_reason_of_a_slow_gain_is_that_of_the_moves(
     experiment: Experiment, resting: Plan
 ) -> None:
-    excitation, _ = experiment.excitation(paths_of(experiment.cell, resting.moves))
+    paths = paths_of(experiment.cell, resting.moves)
+    excitation, _ = experiment.excitation(paths)
     runs = [(excitation, (None, 0))]
     judged = verdicts(experiment.design, runs).gains
     causes = [slow_cause(gain, has_payload=True) for gain in judged]

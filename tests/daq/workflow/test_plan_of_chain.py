@@ -28,7 +28,8 @@ SECONDS = 9.0
 @pytest.fixture(scope="module")
 def cell() -> Cell:
     """Four motors, three degrees of freedom."""
-    return load_cell(shipped_configurations() / "cells" / "dualv.yaml")
+    path = shipped_configurations() / "cells" / "dualv.yaml"
+    return load_cell(path)
 
 
 @pytest.fixture(scope="module")
@@ -38,15 +39,15 @@ def experiment(cell: Cell) -> Experiment:
 
 
 def test_the_payload_is_expected_at_the_platform() -> None:
-    five_bar = load_cell(shipped_configurations() / "cells" / "five-bar.yaml")
+    path = shipped_configurations() / "cells" / "five-bar.yaml"
+    five_bar = load_cell(path)
     expected = experiment_of(five_bar)
     (payload,) = expected.design.expectation.payloads
     centre = payload.parameters[6:9] / payload.parameters[9]
     # The plate is at the end of the rod, 0.45 m from the joint that moves it.
     assert centre == pytest.approx([0.45, 0.0, 0.0], abs=0.15)
-    (body,) = (
-        capsule for capsule in expected.scene.checker.scene.capsules if capsule.name == "payload"
-    )
+    capsules = expected.scene.checker.scene.capsules
+    (body,) = (capsule for capsule in capsules if capsule.name == "payload")
     assert body.start_m == pytest.approx((0.45, 0.0, 0.0), abs=0.15)
 
 
@@ -79,20 +80,24 @@ def _searched(
 def test_the_planners_own_plan_shows_every_gain(
     cell: Cell, experiment: Experiment, made: Plan
 ) -> None:
-    judged = verdicts(
-        experiment.design, [(experiment.excitation(paths_of(cell, made.moves))[0], RUNS)]
-    )
+    paths = paths_of(cell, made.moves)
+    runs = [(experiment.excitation(paths)[0], RUNS)]
+    judged = verdicts(experiment.design, runs)
     assert judged.rank == judged.known_preload_rank == 4
     assert not judged.sentences(cell.axis_names)
-    lower, upper = np.array([axis.limits.position for axis in cell.axes]).T
-    targets = np.array([move.target_rad for move in made.moves])
+    positions = [axis.limits.position for axis in cell.axes]
+    lower, upper = np.array(positions).T
+    target_rad = [move.target_rad for move in made.moves]
+    targets = np.array(target_rad)
     assert ((targets >= lower) & (targets <= upper)).all()
     text = plan_text(Path("plan.yaml"), None, cell, experiment, made, judged, SECONDS)
     assert (
         "Internal preload obscures no gain: these moves determine 4 of 4 independent directions"
     ) in text
     assert "\nAssumed:\n  payload: disc, 8.2 kg\n" in text
-    assert max(len(line) for line in text.partition("Assumed:")[2].splitlines()[:7]) < 110
+    lines = text.partition("Assumed:")[2].splitlines()
+    largest_line_count = max(len(line) for line in lines[:7])
+    assert largest_line_count < 110
     page = preview_page(cell, made.moves, experiment.scene.checker, b"plan")
     assert "The shape of the arm is unknown: links of a closed chain are not guessed" in page
 
@@ -101,23 +106,21 @@ def test_a_weak_gain_is_told_how_to_become_good(
     cell: Cell, experiment: Experiment, made: Plan
 ) -> None:
     """σ falls with the square root of the time: the same moves made so many times over are good."""
-    excitation = experiment.excitation(paths_of(cell, made.moves))[0]
-    judged = verdicts(experiment.design, [(excitation, RUNS)])
+    paths = paths_of(cell, made.moves)
+    excitation = experiment.excitation(paths)[0]
+    runs = [(excitation, RUNS)]
+    judged = verdicts(experiment.design, runs)
     worst = max(gain.std_percent for gain in judged.gains)
     assert worst > 1.0
-    (line,) = (
-        line
-        for line in plan_text(
-            Path("plan.yaml"), None, cell, experiment, made, judged, SECONDS
-        ).splitlines()
-        if line.startswith("For good gains (1 %)")
-    )
+    text = plan_text(Path("plan.yaml"), None, cell, experiment, made, judged, SECONDS)
+    (line,) = (line for line in text.splitlines() if line.startswith("For good gains (1 %)"))
     seconds = float(line.partition("--duration ")[2].partition(")")[0])
     assert "a heavier payload" in line
     repeated = verdicts(
         experiment.design, [(excitation, RUNS)] * int(np.ceil(seconds / made.duration_s))
     )
-    assert max(gain.std_percent for gain in repeated.gains) <= 1.0
+    largest_std_percent = max(gain.std_percent for gain in repeated.gains)
+    assert largest_std_percent <= 1.0
     good = replace(judged, gains=repeated.gains)
     assert "For good gains" not in plan_text(
         Path("plan.yaml"), None, cell, experiment, made, good, SECONDS
@@ -126,16 +129,17 @@ def test_a_weak_gain_is_told_how_to_become_good(
 
 def test_the_assembly_pose_that_was_found_is_shown(tmp_path: Path) -> None:
     """Bent elbows, declared roughly: the pose shown is the one that closes the loop."""
-    text = (shipped_configurations() / "cells" / "five-bar.yaml").read_text(encoding="utf-8")
+    five_bar_path = shipped_configurations() / "cells" / "five-bar.yaml"
+    text = five_bar_path.read_text(encoding="utf-8")
     text = text.replace("../", f"{shipped_configurations()}/")
     text = text.replace("crank-1: 0, elbow-1: 0, crank-2: 0, elbow-2: 0", "elbow-1: 3, elbow-2: 4")
     (tmp_path / "cell.yaml").write_text(text, encoding="utf-8")
     five_bar = load_cell(tmp_path / "cell.yaml")
     experiment = experiment_of(five_bar)
     made = plan(five_bar, seed=1, duration_s=SECONDS, exchanges=0, experiment=experiment)
-    judged = verdicts(
-        experiment.design, [(experiment.excitation(paths_of(five_bar, made.moves))[0], RUNS)]
-    )
+    paths = paths_of(five_bar, made.moves)
+    runs = [(experiment.excitation(paths)[0], RUNS)]
+    judged = verdicts(experiment.design, runs)
     text = plan_text(Path("plan.yaml"), None, five_bar, experiment, made, judged, SECONDS)
     (line,) = (line for line in text.splitlines() if line.startswith("Assembly pose"))
     assert line == (
@@ -152,7 +156,8 @@ def test_an_interrupted_search_is_repeated_by_its_number_of_exchanges(
     """
     longer = searched[1]
     assert [done for done, _ in longer] == [8, 16]
-    assert longer[:1] == _searched(cell, experiment, 8)[1]
+    expected = _searched(cell, experiment, 8)[1]
+    assert longer[:1] == expected
 
 
 def test_the_same_moves_around_one_pose_hide_gains(
@@ -166,18 +171,20 @@ def test_the_same_moves_around_one_pose_hide_gains(
     moves = tuple(
         replace(m, target_rad=tuple(t.tolist())) for m, t in zip(made.moves, near, strict=True)
     )
-    judged = verdicts(experiment.design, [(experiment.excitation(paths_of(cell, moves))[0], RUNS)])
+    paths = paths_of(cell, moves)
+    runs = [(experiment.excitation(paths)[0], RUNS)]
+    judged = verdicts(experiment.design, runs)
     hidden = judged.hidden(Hidden.PRELOAD)
     assert hidden
     assert judged.known_preload_rank is not None
     assert judged.rank < judged.known_preload_rank
     named = [cell.axis_names[axis] for axis in hidden]
-    text = plan_text(
-        Path("plan.yaml"), None, cell, experiment, replace(made, moves=moves), judged, SECONDS
-    )
+    changed_made = replace(made, moves=moves)
+    text = plan_text(Path("plan.yaml"), None, cell, experiment, changed_made, judged, SECONDS)
     (line,) = (line for line in text.splitlines() if line.startswith("Internal preload obscures"))
     assert [name for name in cell.axis_names if name in line] == named
-    gains = plan_report(Path("plan.yaml"), cell, experiment, made, judged).gains
+    report = plan_report(Path("plan.yaml"), cell, experiment, made, judged)
+    gains = report.gains
     assert [gain.axis for gain in gains if gain.hidden_by == "preload"] == named
     for gain in gains:
         assert gain.known_preload_std_percent is not None and gain.predicted_std_percent is not None
@@ -193,11 +200,12 @@ def test_a_workspace_too_small_for_the_gains_is_refused_with_the_reason(
         replace(axis, limits=replace(axis.limits, position=(low, high))) for axis in cell.axes
     )
     tight = replace(cell, axes=axes)
+    changed_experiment = replace(experiment, cell=tight)
     with pytest.raises(UsageError, match="Internal preload obscures the gains of"):
         plan(
             tight,
             seed=1,
             duration_s=SECONDS,
             exchanges=0,
-            experiment=replace(experiment, cell=tight),
+            experiment=changed_experiment,
         )

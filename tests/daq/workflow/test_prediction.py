@@ -36,7 +36,9 @@ CYCLES = np.arange(SAMPLES)
 @pytest.fixture(scope="module")
 def cell(checkout: Path) -> Cell:
     """The demo cell."""
-    return load_cell(checkout / "configs" / "cells" / "demo.yaml")
+    cells_folder = checkout / "configs" / "cells"
+    path = cells_folder / "demo.yaml"
+    return load_cell(path)
 
 
 def _motion(cell: Cell) -> tuple[np.ndarray, np.ndarray]:
@@ -47,13 +49,15 @@ def _motion(cell: Cell) -> tuple[np.ndarray, np.ndarray]:
         time_s[:, None] < 4.0, np.sin(2.0 * np.pi * frequency * time_s[:, None]), 0.0
     )
     position[time_s >= 4.0] = position[time_s < 4.0][-1]
-    return 0.5 * position, np.random.default_rng(1).normal(0.0, 1.0, position.shape)
+    rng = np.random.default_rng(1)
+    return 0.5 * position, rng.normal(0.0, 1.0, position.shape)
 
 
 def _with_late_position(calibration: Calibration) -> Calibration:
     late = Parameter("late-position time 3", 0.012, 0.001, "s")
     effect = AcceptedEffect("late-position", "J3", {}, (late,), 6.0, 3.0)
-    return replace(calibration, effects=(effect,), parameters=(*calibration.parameters, late))
+    parameters = (*calibration.parameters, late)
+    return replace(calibration, effects=(effect,), parameters=parameters)
 
 
 @pytest.mark.parametrize(("block", "is_late"), [(1, False), (10, False), (997, False), (10, True)])
@@ -65,20 +69,22 @@ def test_rows_are_those_of_the_whole_run(cell: Cell, block: int, *, is_late: boo
     position, current = _motion(cell)
     predictor = Predictor(calibration, cell, None, RATE_HZ)
     blocks = [slice(at, at + block) for at in range(0, SAMPLES, block)]
-    found = [
-        part for one in blocks for part in predictor.take(CYCLES[one], position[one], current[one])
-    ]
+    found = []
+    for one in blocks:
+        found.extend(predictor.take(CYCLES[one], position[one], current[one]))
     cycle, predicted, residual = (
         np.concatenate([getattr(part, name) for part in found])
         for name in ("cycle", "predicted", "residual")
     )
     # Each row once, without a gap, until the windows of the last samples are not whole.
-    assert set(np.diff(cycle)) == {10}
+    cycle_steps = set(np.diff(cycle))
+    assert cycle_steps == {10}
     assert cycle[0] < 0.3 * RATE_HZ and cycle[-1] > SAMPLES - (
         0.6 * RATE_HZ if block < 100 else 1000
     )
     conditioning = conditioning_of(calibration)
-    run = Run("whole", np.arange(SAMPLES) / RATE_HZ, position, current, None, None)
+    time_s = np.arange(SAMPLES) / RATE_HZ
+    run = Run("whole", time_s, position, current, None, None)
     data = differentiate(run, model.drive_train, conditioning)
     filter_ = row_filter(data, conditioning)
     expected = filter_(predict_current(calibration, model, data).T)
@@ -89,9 +95,8 @@ def test_rows_are_those_of_the_whole_run(cell: Cell, block: int, *, is_late: boo
     # The grid of the rows is another: the whole run's are interpolated between.
     axis = np.arange(expected.shape[1])
     for motor in range(len(cell.axes)):
-        assert predicted[moving, motor] == pytest.approx(
-            np.interp(at_row, axis, expected[motor])[moving], abs=0.05
-        )
+        interpolated_at_row = np.interp(at_row, axis, expected[motor])
+        assert predicted[moving, motor] == pytest.approx(interpolated_at_row[moving], abs=0.05)
     on_grid = moving & (at_row == np.floor(at_row))
     for motor in range(len(cell.axes)):
         rows = at_row[on_grid].astype(int)
@@ -111,10 +116,12 @@ def test_nothing_is_predicted_at_standstill_and_a_gap_begins_anew(cell: Cell) ->
     assert np.isnan(still.predicted).all() and np.isnan(still.residual).all()
     # The gap is within the block.
     cycle = np.concatenate((CYCLES[500:600], CYCLES[:500] + 10_000))
+    stacked_position = np.concatenate((position[2600:2700], position[:500]))
+    stacked_current = np.concatenate((current[2600:2700], current[:500]))
     (after,) = predictor.take(
         cycle,
-        np.concatenate((position[2600:2700], position[:500])),
-        np.concatenate((current[2600:2700], current[:500])),
+        stacked_position,
+        stacked_current,
     )
     assert after.cycle[0] > 10_000
     assert np.isfinite(after.predicted).any()
@@ -126,7 +133,10 @@ def _rows(residual: float, seconds: float, motors: int = 2) -> PredictedRows:
     count = round(50.0 * seconds)
     column = np.full((count, motors), np.nan)
     column[:, 0] = residual
-    return PredictedRows(np.arange(count), 0.0 * column, column, np.ones(motors))
+    cycle = np.arange(count)
+    predicted = 0.0 * column
+    band = np.ones(motors)
+    return PredictedRows(cycle, predicted, column, band)
 
 
 def test_an_axis_is_judged_by_the_last_ten_seconds_in_which_it_moved() -> None:
@@ -138,48 +148,48 @@ def test_an_axis_is_judged_by_the_last_ten_seconds_in_which_it_moved() -> None:
     for _ in range(10):
         recent.add(_rows(np.nan, RECENT_S))  # a rest heals nothing
     found, other = recent.axes()
-    assert (found.measured, found.predicted, found.outside_share, found.conspicuous) == (
-        None,
-        None,
-        1.0,
-        True,
-    )
+    expected = (None, None, 1.0, True)
+    assert (found.measured, found.predicted, found.outside_share, found.conspicuous) == expected
     assert found.residual_rms == pytest.approx(3.0)
     assert (other.residual_rms, other.outside_share, other.conspicuous) == (None, 0.0, False)
     recent.add(_rows(0.5, 6.0))  # 4 s of 8 s are left in the ten seconds of motion
-    assert recent.axes()[0].outside_share == pytest.approx(0.4)
+    outside_share = recent.axes()[0].outside_share
+    assert outside_share == pytest.approx(0.4)
     assert not recent.axes()[0].conspicuous
     recent.add(_rows(0.5, 4.0))
     assert recent.axes()[0].outside_share == 0.0
 
 
 def test_another_mass_than_that_of_the_calibration_is_refused(cell: Cell) -> None:
-    known = Parameter("m:disc", 4.59, 0.0, "kg"), Parameter("mx:disc", 0.1, 0.01, "kg m")
+    parameter = Parameter("m:disc", 4.59, 0.0, "kg")
+    known = parameter, Parameter("mx:disc", 0.1, 0.01, "kg m")
     calibration = predicting_calibration()
-    calibration = replace(calibration, parameters=(*calibration.parameters, *known))
+    parameters = (*calibration.parameters, *known)
+    calibration = replace(calibration, parameters=parameters)
     weighed = replace(cell.payloads[0], name="disc", mounting="disc", mass_kg=4.59)
     run = replace(facts(cell, None), payload="disc")
     for mass_kg, remark in (
         (4.59, ""),
         (5.0, "carries 5 kg on mounting 'disc'; the calibration has 4.59 kg"),
     ):
-        _, found = predictor_of(
-            calibration, replace(cell, payloads=(replace(weighed, mass_kg=mass_kg),)), run
-        )
+        payloads = (replace(weighed, mass_kg=mass_kg),)
+        changed_cell = replace(cell, payloads=payloads)
+        _, found = predictor_of(calibration, changed_cell, run)
         assert remark in found and bool(found) == bool(remark)
 
 
 def test_another_payload_on_the_mounting_of_the_calibration_is_not_predicted(cell: Cell) -> None:
     """A payload of the same mass, and one of which all is known: both are other bodies."""
     of_disc = Parameter("mx:flange", 0.1, 0.01, "kg m")
-    source = Source("loaded", "a" * 64, "fit", payload="disc", mass_kg=4.59, mounting="flange")
+    sha256 = "a" * 64
+    source = Source("loaded", sha256, "fit", payload="disc", mass_kg=4.59, mounting="flange")
     calibration = predicting_calibration()
-    calibration = replace(
-        calibration, parameters=(*calibration.parameters, of_disc), sources=(source,)
-    )
+    parameters = (*calibration.parameters, of_disc)
+    calibration = replace(calibration, parameters=parameters, sources=(source,))
     weighed = replace(cell.payloads[0], name="box", mounting="flange", mass_kg=4.59)
     run = replace(facts(cell, None), payload="box")
-    found, remark = predictor_of(calibration, replace(cell, payloads=(weighed,)), run)
+    changed_cell = replace(cell, payloads=(weighed,))
+    found, remark = predictor_of(calibration, changed_cell, run)
     assert found is None
     assert "found payload 'box' on mounting 'flange'; expected payload 'disc'" in remark
     known = {"m": 4.59, "mx": 0.2}
@@ -201,10 +211,12 @@ def test_what_the_calibration_does_not_know_is_not_predicted(cell: Cell) -> None
     assert "nothing is known of mounting" in unknown.problem
     position, current = _motion(cell)
     assert unknown.take(CYCLES, position, current) == []
+    calibration = replace(predicting_calibration(), cell="other")
+    changed_cell = replace(cell, folder=Path())
     with pytest.raises(LogsDiffer):
         Predictor(
-            replace(predicting_calibration(), cell="other"),
-            replace(cell, folder=Path()),
+            calibration,
+            changed_cell,
             None,
             RATE_HZ,
         )

@@ -54,16 +54,19 @@ def blocks(cell: Cell, nothing: GainsSoFar) -> tuple[Run, ...]:
 def _facts(cell: Cell, payload: str | None) -> RunFacts:
     count = len(cell.axes)
     identity = np.eye(count).tolist()
+    rad_per_count = [COUNT_RAD] * count
+    current_per_unit = [RAW_A] * count
+    offset_rad = [0.0] * count
     return RunFacts(
         run_id="id",
         log="block.mcap",
         axes=cell.axis_names,
         rate_hz=RATE_HZ,
         moves=3,
-        rad_per_count=[COUNT_RAD] * count,
-        current_per_unit=[RAW_A] * count,
+        rad_per_count=rad_per_count,
+        current_per_unit=current_per_unit,
         to_joint=identity,
-        offset_rad=[0.0] * count,
+        offset_rad=offset_rad,
         payload=payload,
         bus_load={},
     )
@@ -80,7 +83,8 @@ def _rows(cell: Cell, run: Run) -> NDArray[np.void]:
 
 
 def _start(number: int, time_s: float) -> CellEvent:
-    return CellEvent(round(1e9 * time_s), None, EventKind.MOVE_START, number, "")
+    time_ns = round(1e9 * time_s)
+    return CellEvent(time_ns, None, EventKind.MOVE_START, number, "")
 
 
 def test_the_samples_of_the_feed_are_a_run_in_si(
@@ -89,7 +93,8 @@ def test_the_samples_of_the_feed_are_a_run_in_si(
     loaded = blocks[1]
     rows = _rows(cell, loaded)
     rows["missing"][7] = 0b100  # J3 did not answer
-    so_far = RunSoFar(cell, _facts(cell, "disc"), "block-2-loaded")
+    facts = _facts(cell, "disc")
+    so_far = RunSoFar(cell, facts, "block-2-loaded")
     assert so_far.run() is None
     so_far.take_event(_start(0, 0.0))
     so_far.take(rows[:100])
@@ -104,14 +109,16 @@ def test_the_samples_of_the_feed_are_a_run_in_si(
     np.testing.assert_allclose(found.current_a, loaded.current_a, atol=RAW_A)
     assert found.move is not None
     assert found.valid is not None
-    assert found.move.tolist() == [0] * 250 + [1] * (len(rows) - 250)
+    expected = [0] * 250 + [1] * (len(rows) - 250)
+    assert found.move.tolist() == expected
     assert np.argwhere(~found.valid).tolist() == [[7, 2]]
 
 
 @pytest.mark.parametrize("lost", [50, 100], ids=["within a packet", "between two packets"])
 def test_a_cycle_that_is_missing_is_noticed(cell: Cell, blocks: tuple[Run, ...], lost: int) -> None:
     rows = np.delete(_rows(cell, blocks[0]), lost)
-    so_far = RunSoFar(cell, _facts(cell, None), "block-1-bare")
+    facts = _facts(cell, None)
+    so_far = RunSoFar(cell, facts, "block-1-bare")
     so_far.take(rows[:100])
     so_far.take(rows[100:200])
     assert not so_far.is_whole
@@ -125,10 +132,8 @@ def test_there_are_no_figures_before_both_kinds_of_block_and_half_a_minute(
     first = after_bare.look(PLACE, {})
     assert not first.gains
     assert "no block with DISC" in first.missing
-    assert (
-        "a block without DISC"
-        in nothing.with_run(loaded).with_motion(loaded).look(PLACE, {}).missing
-    )
+    missing = nothing.with_run(loaded).with_motion(loaded).look(PLACE, {}).missing
+    assert "a block without DISC" in missing
     short = replace(after_bare.with_run(loaded).with_motion(loaded), motion_s=29.0)
     assert not short.look(PLACE, {}).gains
     assert "30 s of motion" in short.look(PLACE, {}).missing
@@ -147,19 +152,24 @@ def test_after_a_move_each_gain_is_beside_its_target_with_the_worst_first(
         .look(PLACE, {})
     )
     assert look.missing == ""
-    assert [gain.target_percent for gain in look.gains] == [TARGET_PERCENT] * len(GAINS)
+    expected = [TARGET_PERCENT] * len(GAINS)
+    target_percent = [gain.target_percent for gain in look.gains]
+    assert target_percent == expected
     ratios = [gain.ratio for gain in look.gains]
     assert ratios == sorted(ratios, reverse=True)
     by_axis = {gain.axis: gain for gain in look.gains}
-    for axis, truth in zip(nothing.experiment.cell.axis_names, GAINS, strict=True):
+    axis_names = nothing.experiment.cell.axis_names
+    for axis, truth in zip(axis_names, GAINS, strict=True):
         found = by_axis[axis]
-        assert abs(found.value - truth) < 5.0 * 0.01 * found.std_percent * abs(truth), axis
+        difference = abs(found.value - truth)
+        assert difference < 5.0 * 0.01 * found.std_percent * abs(truth), axis
     # σ falls as 1/√time.
     assert look.left_s == pytest.approx(look.motion_s * (ratios[0] ** 2 - 1.0))
     assert look.why
     worst = look.gains[0].axis
     known = nothing.with_run(bare).with_motion(bare).with_run(loaded).with_motion(loaded)
-    assert known.look(PLACE, {worst: "its current is noisy"}).why == "its current is noisy"
+    why = known.look(PLACE, {worst: "its current is noisy"}).why
+    assert why == "its current is noisy"
 
 
 def test_sigma_goes_on_from_that_of_the_estimator(
@@ -175,7 +185,8 @@ def test_sigma_goes_on_from_that_of_the_estimator(
     judged = quick * np.array([1.0, 1.0, 0.2, 1.0, 1.0, 1.0])
     continued = known.in_proportion(judged)
     names = nothing.experiment.cell.axis_names
-    shown = {gain.axis: gain.std_percent for gain in continued.look(PLACE, {}).gains}
+    gains = continued.look(PLACE, {}).gains
+    shown = {gain.axis: gain.std_percent for gain in gains}
     assert [shown[name] for name in names] == pytest.approx(judged.tolist())
     raw = {
         gain.axis: gain.std_percent
@@ -204,5 +215,8 @@ def test_sigma_falls_while_a_block_grows(nothing: GainsSoFar, blocks: tuple[Run,
         growing = growing.with_run(part, is_complete=False)
         looks.append(growing.with_motion(part).look(PLACE, {}))
     assert looks[0].motion_s < looks[1].motion_s
-    mean = [np.mean([gain.std_percent for gain in look.gains]) for look in (before, *looks)]
+    mean = []
+    for look in (before, *looks):
+        std_percent = [gain.std_percent for gain in look.gains]
+        mean.append(np.mean(std_percent))
     assert mean[2] < mean[0]

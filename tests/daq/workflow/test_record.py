@@ -56,7 +56,8 @@ class Rig:
             (configs / "cells/demo.yaml").read_text().replace("../robots", str(configs / "robots"))
         )
         self.cell_file = folder / "cell.yaml"
-        self.cell_file.write_text(text.replace("pacing: lockstep", f"pacing: {pacing}"))
+        changed_text = text.replace("pacing: lockstep", f"pacing: {pacing}")
+        self.cell_file.write_text(changed_text)
         self.plan = folder / "plan.yaml"
         self.plan.write_text(PLAN)
         self.out = folder / "a.mcap"
@@ -144,9 +145,12 @@ def test_a_sound_run_is_valid_and_starts_at_wall_time(
     done = rig.run()
     assert (done.log.valid, done.log.reason, done.log.lost_cycles) == (True, "", 0)
     time_ns = read_log(rig.out).samples.time_ns
-    assert time_ns.tolist() == [WALL_NS + PERIOD_NS * k for k in range(len(time_ns))]
-    assert all(event.time_ns in time_ns for event in read_log(rig.out).events)
-    assert load_run(rig.out)[0].move is not None
+    expected = [WALL_NS + PERIOD_NS * k for k in range(len(time_ns))]
+    assert time_ns.tolist() == expected
+    events = read_log(rig.out).events
+    assert all(event.time_ns in time_ns for event in events)
+    move = load_run(rig.out)[0].move
+    assert move is not None
 
 
 def test_a_glitch_of_an_encoder_makes_the_run_invalid(lockstep: Rig) -> None:
@@ -161,7 +165,8 @@ def test_a_glitch_of_an_encoder_makes_the_run_invalid(lockstep: Rig) -> None:
     def tamper(message: can.Message) -> Iterable[can.Message]:
         if message.arbitration_id == 0x180 + ELBOW and lockstep.bus.cycle == begun + middle:
             position = int.from_bytes(message.data[:4], "little", signed=True)
-            assert abs(position - ELBOW_COUNTS) < ELBOW_COUNTS // 4
+            position_difference = abs(position - ELBOW_COUNTS)
+            assert position_difference < ELBOW_COUNTS // 4
             wrong.append(position)
             glitch = position + round(0.9 * 45 / (2 * 3.141592653589793) * 65536)
             message.data[:4] = glitch.to_bytes(4, "little", signed=True)
@@ -186,7 +191,9 @@ def test_what_is_done_before_the_first_sample_costs_no_period(
     monkeypatch.setattr("daq.workflow.record.bundle", slow_bundle)
     done = timed.run()
     assert (done.log.valid, done.log.reason) == (True, "")
-    assert set(np.diff(read_log(timed.out).samples.time_ns)) == {PERIOD_NS}
+    samples = read_log(timed.out).samples
+    time_steps_ns = np.diff(samples.time_ns)
+    assert set(time_steps_ns) == {PERIOD_NS}
 
 
 def test_moves_are_planned_from_where_the_axes_are_known_to_be(
@@ -200,7 +207,8 @@ def test_moves_are_planned_from_where_the_axes_are_known_to_be(
     assert samples.position_counts[0, ELBOW - 1] == ELBOW_COUNTS
     assert (done.log.valid, done.log.reason) == (True, "")
     (tmp_path / "sound").mkdir()
-    sound = Rig(checkout, tmp_path / "sound", monkeypatch, "lockstep")
+    folder = tmp_path / "sound"
+    sound = Rig(checkout, folder, monkeypatch, "lockstep")
     sound.run()
     assert lockstep.profiles() == sound.profiles() != []
 
@@ -288,9 +296,11 @@ def test_a_wall_clock_that_was_set_meanwhile_shows_and_moves_no_stamp(
     log = read_log(lockstep.out)
     assert log.statistics.wall_minus_monotonic_ns == WALL_NS + step_ns
     assert log.head.run.wall_minus_monotonic_ns == WALL_NS
-    assert set(np.diff(log.samples.time_ns)) == {PERIOD_NS}
+    time_steps_ns = np.diff(log.samples.time_ns)
+    assert set(time_steps_ns) == {PERIOD_NS}
     assert main(["info", str(lockstep.out), "--json"]) == ExitCode.OK
-    assert json.loads(capsys.readouterr().out)["wall_clock_step_s"] == step_ns * 1e-9
+    document = json.loads(capsys.readouterr().out)
+    assert document["wall_clock_step_s"] == step_ns * 1e-9
 
 
 def test_what_is_reported_after_the_last_sample_counts_too(
@@ -313,7 +323,8 @@ def test_what_is_reported_after_the_last_sample_counts_too(
     monkeypatch.setattr(bus, "recv", late)
     done = lockstep.run()
     assert (done.log.valid, done.log.reason) == (False, "2 frames dropped by the interface")
-    assert any(event.kind is EventKind.FRAMES_DROPPED for event in read_log(lockstep.out).events)
+    events = read_log(lockstep.out).events
+    assert any(event.kind is EventKind.FRAMES_DROPPED for event in events)
 
 
 @pytest.mark.parametrize(
@@ -329,7 +340,8 @@ def test_a_recording_that_ended_early_is_not_salvaged_as_a_valid_one(
     lockstep.bus.on_cycle = end
     with pytest.raises((KeyboardInterrupt, NodeMisplaced)):
         lockstep.run()
-    saved = salvage(lockstep.out.with_name("a.mcap.part"), tmp_path / "saved.mcap")
+    damaged = lockstep.out.with_name("a.mcap.part")
+    saved = salvage(damaged, tmp_path / "saved.mcap")
     assert not saved.statistics.valid
     assert "ended (" in saved.statistics.reason
 
@@ -356,7 +368,8 @@ def test_an_answer_that_comes_twice_to_the_last_sync_of_all_is_counted(lockstep:
     lockstep.bus.tamper = tamper
     done = lockstep.run()
     assert doubled[-1] == lockstep.bus.cycle
-    assert (done.log.valid, done.log.reason) == (False, f"{len(doubled)} answers twice")
+    expected = (False, f"{len(doubled)} answers twice")
+    assert (done.log.valid, done.log.reason) == expected
 
 
 def test_axes_that_are_stopped_by_sdo_leave_no_doubt_about_the_samples(
@@ -385,7 +398,8 @@ def test_another_master_that_reads_meanwhile_is_named_at_the_end(lockstep: Rig) 
     lockstep.bus.on_cycle = lambda cycle: lockstep.bus.inject(reading) if cycle == 200 else None
     done = lockstep.run()
     assert done.log.valid
-    assert [text for text in done.warnings if "another master" in text] == [
+    texts = [text for text in done.warnings if "another master" in text]
+    assert texts == [
         "another master was on the bus: an SDO request to J2 (node 2) (602h); it only read, but "
         "end that program before the next run"
     ]

@@ -71,7 +71,8 @@ def test_where_the_cell_allows_it_the_axis_goes_slowly_back_and_the_run_begins(
     velocity, acceleration = struct.unpack_from("<II", first)
     assert 0 < velocity <= RECOVERY_SPEED * 1.01 * limits.velocity * scale
     assert 0 < acceleration <= RECOVERY_SPEED * 1.01 * limits.acceleration * scale
-    samples = read_log(outside.out).samples.position_counts[:, ELBOW - 1]
+    position_counts = read_log(outside.out).samples.position_counts
+    samples = position_counts[:, ELBOW - 1]
     assert samples[0] < LIMIT  # the log begins behind the return
 
 
@@ -91,7 +92,9 @@ def test_no_motor_of_a_closed_chain_moves_alone(
     outside: Rig, checkout: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     permit(outside, recovery_motion="allowed")
-    chain = load_cell(checkout / "configs" / "cells" / "five-bar.yaml").chain
+    cells_folder = checkout / "configs" / "cells"
+    path = cells_folder / "five-bar.yaml"
+    chain = load_cell(path).chain
     assert chain is not None
     monkeypatch.setattr(
         "daq.workflow.record.recovery_move",
@@ -129,7 +132,8 @@ def test_the_policy_for_jobs_moves_no_axis_of_a_person_that_no_one_would_stop(
 
 def test_neither_is_part_of_what_a_recording_depends_on(outside: Rig) -> None:
     before = load_cell(outside.cell_file)
-    assert (before.unguarded, before.recovery_motion) == (Permission.REFUSED, Permission.REFUSED)
+    expected = (Permission.REFUSED, Permission.REFUSED)
+    assert (before.unguarded, before.recovery_motion) == expected
     permit(outside, unguarded="allowed", recovery_motion="allowed")
     after = load_cell(outside.cell_file)
     assert (after.unguarded, after.recovery_motion) == (Permission.ALLOWED, Permission.ALLOWED)

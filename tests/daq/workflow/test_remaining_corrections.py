@@ -36,11 +36,12 @@ def _calibration(*effects: AcceptedEffect) -> Calibration:
 
 
 def _zero() -> AcceptedEffect:
+    coefficients = (Parameter("zero-offset offset 2", ZERO_RAD, 1e-3, "rad"),)
     return AcceptedEffect(
         "zero-offset",
         "J2",
         {},
-        (Parameter("zero-offset offset 2", ZERO_RAD, 1e-3, "rad"),),
+        coefficients,
         6.0,
         3.0,
     )
@@ -66,11 +67,11 @@ def _with_zero(cell: Cell, offset_rad: float) -> Cell:
 
 @pytest.mark.parametrize("corrected_rad", [0.0, 0.5 * ZERO_RAD, ZERO_RAD, -0.01])
 def test_of_a_zero_the_difference_to_the_cell_is_left(cell: Cell, corrected_rad: float) -> None:
-    known = with_described(_calibration(_zero()), cell)
+    calibration = _calibration(_zero())
+    known = with_described(calibration, cell)
     left, _ = on_cell(known, _with_zero(cell, corrected_rad))
-    assert left.effects[0].coefficients[0].value == pytest.approx(
-        ZERO_RAD - corrected_rad, abs=1e-12
-    )
+    coefficient = left.effects[0].coefficients[0].value
+    assert coefficient == pytest.approx(ZERO_RAD - corrected_rad, abs=1e-12)
 
 
 ZERO_OFF = Diagnosis(
@@ -91,22 +92,28 @@ TILTED = Diagnosis("gravity-tilted", (), (), "gravity turned", "the cell file's"
 def test_a_zero_that_the_cell_file_has_right_since_is_not_named_again(
     cell: Cell, corrected_rad: float, left: tuple[Diagnosis, ...]
 ) -> None:
-    known = replace(with_described(_calibration(_zero()), cell), diagnoses=(ZERO_OFF, OTHER_ZERO))
+    calibration = _calibration(_zero())
+    known = replace(with_described(calibration, cell), diagnoses=(ZERO_OFF, OTHER_ZERO))
     assert not_corrected_since(known, _with_zero(cell, corrected_rad)) == left
 
 
 def test_a_mounting_that_the_cell_file_has_right_since_is_not_named_again(cell: Cell) -> None:
-    known = replace(with_described(_calibration(_gravity()), cell), diagnoses=(TILTED,))
+    calibration = _calibration(_gravity())
+    known = replace(with_described(calibration, cell), diagnoses=(TILTED,))
     assert not_corrected_since(known, cell) == (TILTED,)
-    found = turned_gravity(model_of(cell).robot.gravity_m_s2, TURN_RAD)
-    assert not_corrected_since(known, replace(cell, gravity_m_s2=tuple(found))) == ()
+    declared_m_s2 = model_of(cell).robot.gravity_m_s2
+    found = turned_gravity(declared_m_s2, TURN_RAD)
+    changed_cell = replace(cell, gravity_m_s2=tuple(found))
+    assert not_corrected_since(known, changed_cell) == ()
 
 
 def test_of_gravity_the_turn_from_the_cell_is_left(cell: Cell) -> None:
-    known = with_described(_calibration(_gravity()), cell)
+    calibration = _calibration(_gravity())
+    known = with_described(calibration, cell)
     declared = model_of(cell).robot.gravity_m_s2
     found = turned_gravity(declared, TURN_RAD)
-    half = turned_gravity(declared, [0.5 * turn for turn in TURN_RAD])
+    turn_rad = [0.5 * turn for turn in TURN_RAD]
+    half = turned_gravity(declared, turn_rad)
     for now in (declared, half, found):
         changed = replace(cell, gravity_m_s2=tuple(now))
         left, model = on_cell(known, changed)
@@ -118,15 +125,20 @@ def test_a_calibration_of_before_corrects_as_a_whole(cell: Cell) -> None:
     """It does not say how the number was described;
     `validate`, `weigh` and `contact` warn of it.
     """
-    left, _ = on_cell(_calibration(_zero()), _with_zero(cell, ZERO_RAD))
-    assert left.effects[0].coefficients[0].value == ZERO_RAD
+    calibration = _calibration(_zero())
+    left, _ = on_cell(calibration, _with_zero(cell, ZERO_RAD))
+    coefficients = left.effects[0].coefficients
+    assert coefficients[0].value == ZERO_RAD
 
 
 def test_what_was_described_is_kept_in_the_file(cell: Cell) -> None:
-    known = with_described(_calibration(_zero(), _gravity()), cell)
+    calibration = _calibration(_zero(), _gravity())
+    known = with_described(calibration, cell)
     read = decode_calibration(encode_calibration(known), "calibration.yaml")
-    assert [one.described for one in read.effects] == [one.described for one in known.effects]
-    assert known.effects[0].described == (cell.axes[1].zero_offset_rad,)
+    expected = [one.described for one in known.effects]
+    assert [one.described for one in read.effects] == expected
+    described = known.effects[0].described
+    assert described == (cell.axes[1].zero_offset_rad,)
 
 
 @given(angles, angles, angles, angles)

@@ -41,20 +41,25 @@ def test_a_real_log_as_a_table(
     assert main(["export", "csv", str(calibration), str(log), "--out", str(out), "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
     assert main(["validate", str(calibration), str(log), "--json"]) == 0
-    (validated,) = json.loads(capsys.readouterr().out)["logs"]
+    document = json.loads(capsys.readouterr().out)
+    (validated,) = document["logs"]
     table = _table(out)
     assert list(table) == report["columns"]
     assert len(table["time_s"]) == report["rows"]
     assert report["relative_error_percent"] == validated["relative_error_percent"]
     counted = 0
-    for number, expected in enumerate(validated["relative_error_percent"]["axes"], start=1):
+    axes = validated["relative_error_percent"]["axes"]
+    for number, expected in enumerate(axes, start=1):
         name = f"J{number}"
         measured = table[f"{name}.torque_measured_Nm"]
         residual = table[f"{name}.torque_residual_Nm"]
-        assert residual == pytest.approx(measured - table[f"{name}.torque_predicted_Nm"], abs=1e-12)
+        measured_difference = measured - table[f"{name}.torque_predicted_Nm"]
+        assert residual == pytest.approx(measured_difference, abs=1e-12)
         rows = table[f"{name}.counts"] == 1.0
         counted += int(rows.sum())
-        error = 100.0 * np.linalg.norm(residual[rows]) / np.linalg.norm(measured[rows])
+        residual_norm = np.linalg.norm(residual[rows])
+        measured_norm = np.linalg.norm(measured[rows])
+        error = 100.0 * residual_norm / measured_norm
         assert error == pytest.approx(expected, rel=1e-9)
     assert counted == validated["rows"]
 
@@ -86,7 +91,9 @@ def test_its_currents_are_those_that_a_drive_would_get(
         assert table[f"J{index + 1}.current_measured_{unit}"] == pytest.approx(
             measured[index], abs=1e-9
         )
-    assert model_of(read_log(log).head.cell(log)).drive_train.coupled == (5,)
+    head = read_log(log).head
+    drive_train = model_of(head.cell(log)).drive_train
+    assert drive_train.coupled == (5,)
 
 
 def test_a_name_that_is_taken_and_a_foreign_calibration_are_refused(

@@ -115,20 +115,22 @@ def of_size(*axes: int) -> Mistake:
 
 def noisy(run: Run) -> Run:
     """A run of which the last current is mostly noise."""
-    noise = np.random.default_rng(0).standard_normal(run.current_a.shape) * np.array(
-        [0.0, 0.0, 1.0]
-    )
-    return replace(run, current_a=run.current_a + noise)
+    rng = np.random.default_rng(0)
+    noise = rng.standard_normal(run.current_a.shape) * np.array([0.0, 0.0, 1.0])
+    current_a = run.current_a + noise
+    return replace(run, current_a=current_a)
 
 
 def reversed_position(run: Run) -> Run:
     """A run in which the position of J2 counts the other way."""
-    return replace(run, position_rad=run.position_rad * np.array([1.0, -1.0, 1.0]))
+    position_rad = run.position_rad * np.array([1.0, -1.0, 1.0])
+    return replace(run, position_rad=position_rad)
 
 
 def offset(run: Run, degrees: float = 4.0) -> Run:
     """A run in which the zero of J2 is off."""
-    return replace(run, position_rad=run.position_rad + np.array([0.0, np.radians(degrees), 0.0]))
+    position_rad = run.position_rad + np.array([0.0, np.radians(degrees), 0.0])
+    return replace(run, position_rad=position_rad)
 
 
 def late_currents(*delays_s: float) -> Mistake:
@@ -139,7 +141,8 @@ def late_currents(*delays_s: float) -> Mistake:
         late = [
             np.interp(run.time_s - delay_s, run.time_s, current) for current, delay_s in columns
         ]
-        return replace(run, current_a=np.stack(late, axis=1))
+        current_a = np.stack(late, axis=1)
+        return replace(run, current_a=current_a)
 
     return lambda runs: [change(run) for run in runs]
 
@@ -152,7 +155,9 @@ def without_zero(run: Run) -> Run:
 def mounted_on_a_wall(runs: Runs) -> Runs:
     """Recordings of an arm whose base is turned from what the cell says."""
     truth = three_axes_truth()
-    wall = replace(truth, model=with_gravity(truth.model, np.array([0.0, -9.81, 0.0])))
+    gravity_m_s2 = np.array([0.0, -9.81, 0.0])
+    model = with_gravity(truth.model, gravity_m_s2)
+    wall = replace(truth, model=model)
     return small_recordings(wall, 0, count=len(runs), seconds=SECONDS)
 
 
@@ -170,7 +175,8 @@ def forgotten(run: Run) -> Run:
 def clipped(run: Run) -> Run:
     """A run in which a limit clips the current of J2, and the drive does not report it."""
     current = run.current_a.copy()
-    limit = float(np.percentile(np.abs(current[:, 1]), 90.0))
+    absolute_current = np.abs(current[:, 1])
+    limit = float(np.percentile(absolute_current, 90.0))
     current[:, 1] = np.clip(current[:, 1], -limit, limit)
     return replace(run, current_a=current)
 
@@ -185,8 +191,10 @@ def glitched(run: Run) -> Run:
 def frozen(run: Run) -> Run:
     """A run in which the position of J2 stands still for a while although the joint moves."""
     position = run.position_rad.copy()
-    speed = np.abs(np.diff(position[:, 1]))
-    start = 1000 + int(np.argmax(speed[1000:-1000]))
+    position_steps = np.diff(position[:, 1])
+    speed = np.abs(position_steps)
+    largest_speed_index = np.argmax(speed[1000:-1000])
+    start = 1000 + int(largest_speed_index)
     position[start : start + 200, 1] = position[start, 1]
     return replace(run, position_rad=position)
 
@@ -200,14 +208,14 @@ def displaced(run: Run) -> Run:
 
 def constant(run: Run) -> Run:
     """A run in which the channel of J2 has one value."""
-    return replace(
-        run, current_a=run.current_a * np.array([1.0, 0.0, 1.0]) + np.array([0.0, 0.5, 0.0])
-    )
+    current_a = run.current_a * np.array([1.0, 0.0, 1.0]) + np.array([0.0, 0.5, 0.0])
+    return replace(run, current_a=current_a)
 
 
 def still(run: Run) -> Run:
     """A run in which the encoder of J3 has one value."""
-    return replace(run, position_rad=run.position_rad * np.array([1.0, 1.0, 0.0]))
+    position_rad = run.position_rad * np.array([1.0, 1.0, 0.0])
+    return replace(run, position_rad=position_rad)
 
 
 #: By mistake: how it is made in the runs r0 to r7, of which r6 and r7 are held out, and what is
@@ -325,19 +333,18 @@ def test_the_same_is_said_by_every_verb(
             verbs["fit_logs"]()
         return
     assert said(fitted.diagnoses) == ({expected} if expected else set())
-    assert texts(verbs["fit_logs"]()) == texts(fitted.diagnoses)
+    diagnoses = verbs["fit_logs"]()
+    assert texts(diagnoses) == texts(fitted.diagnoses)
     assert said(verbs["residual"]()) == said(fitted.diagnoses)
-    calibration = decode_calibration(
-        encode_calibration(calibration_of(fitted, WHEN)), "calibration.yaml"
-    )
+    content = encode_calibration(calibration_of(fitted, WHEN))
+    calibration = decode_calibration(content, "calibration.yaml")
     assert texts(calibration.diagnoses) == texts(fitted.diagnoses)
     for given in (logs, holdout, [*logs, *holdout]):
         assert texts(cross_validate({"one": calibration}, given).diagnoses) == texts(
             fitted.diagnoses
         )
-    page = certificate_page(
-        certify(calibration, without_controller(calibration, "Not read.", WHEN))
-    )
+    comparison = without_controller(calibration, "Not read.", WHEN)
+    page = certificate_page(certify(calibration, comparison))
     shown = unescape(re.sub(r"<[^>]*>|`", "", page))
     for one in fitted.diagnoses:
         assert f"CHECK {one.text}.".replace("`", "") in shown
@@ -361,9 +368,11 @@ def test_a_wrong_description_is_corrected_before_the_next_step(
     for module in (fit_module, validate_module):
         monkeypatch.setattr(module, "load_run", lambda path, *_: (runs[path.name], cell))
     paths = [Path(f"r{number}") for number in range(RUNS)]
-    calibration = calibration_of(fit(paths[:USED], holdout=paths[USED:]), WHEN)
+    fitted = fit(paths[:USED], holdout=paths[USED:])
+    calibration = calibration_of(fitted, WHEN)
     say_after_fit(calibration, paths[:USED], Path("fit.yaml"))
-    assert f"Next: {next_step}" in capsys.readouterr().err
+    error_output = capsys.readouterr().err
+    assert f"Next: {next_step}" in error_output
     assert bool(uncorrected_description(calibration)) == bool(degrees)
     screen = StringIO()
     console = Console(width=400, file=screen)
@@ -378,23 +387,28 @@ def test_a_zero_that_a_given_description_changes_is_tested_on_a_run_without_load
     """It explains a small part of what a run without load leaves, and was not named."""
     runs = {run.name: replace(run, digest=f"{int(run.name[1:]):064x}") for run in recorded}
     monkeypatch.setattr(fit_module, "load_run", lambda path, *_: (runs[path.name], cell))
-    calibration = calibration_of(fit([Path(f"r{number}") for number in range(USED)]), WHEN)
+    logs = [Path(f"r{number}") for number in range(USED)]
+    calibration = calibration_of(fit(logs), WHEN)
     given = Recording(
         None, None, (), (), 0, (), None, replaced_configuration_sha256="a", corrected=(SECTION,)
     )
-    noise_a = 0.06 * np.random.default_rng(1).standard_normal(recorded[6].current_a.shape)
+    rng = np.random.default_rng(1)
+    current_a = recorded[6].current_a
+    noise_a = 0.06 * rng.standard_normal(current_a.shape)
     moved = replace(
         offset(recorded[6], 4.0), current_a=recorded[6].current_a + noise_a, recording=given
     )
     other = replace(cell, digest="other", recording_digest="other")
     found: dict[str, set[str]] = {}
-    for name, run in {"given": moved, "recorded": replace(moved, recording=None)}.items():
+    changed_moved = replace(moved, recording=None)
+    for name, run in {"given": moved, "recorded": changed_moved}.items():
         monkeypatch.setattr(validate_module, "load_run", lambda *_, run=run: (run, other))
         diagnoses = cross_validate({"one": calibration}, [Path("r6")], other).diagnoses
         found[name] = said(diagnoses)
         if name == "given":
             assert "the given cell file has another number here" in diagnoses[0].remedy
-    assert found == {"given": {"zero-off r6 J2"}, "recorded": set()}
+    expected = {"given": {"zero-off r6 J2"}, "recorded": set()}
+    assert found == expected
     # A calibration of the same description predicts in the same geometry.
     made_with_it = replace(calibration, recording_configuration_sha256=other.recording_digest)
     assert replaced_geometry(made_with_it, moved, other) == ()
@@ -405,12 +419,16 @@ def test_a_zero_that_a_fit_has_named_is_named_after_a_search_that_finds_nothing(
 ) -> None:
     runs = {run.name: offset(run) for run in recorded}
     monkeypatch.setattr(fit_module, "load_run", lambda path, *_: (runs[path.name], cell))
-    fitted = fit([Path(f"r{number}") for number in range(USED)])
+    logs = [Path(f"r{number}") for number in range(USED)]
+    fitted = fit(logs)
     evidence = fitted.evidence()
-    step = Step((), (), np.zeros(3), None, evidence, declared=True)
-    beside_declared = description_diagnoses(replace(fitted, steps=(step,)))
+    limits_nm = np.zeros(3)
+    step = Step((), (), limits_nm, None, evidence, declared=True)
+    changed_fitted = replace(fitted, steps=(step,))
+    beside_declared = description_diagnoses(changed_fitted)
     assert said(beside_declared) == {"zero-off J2"}
-    after_search = description_diagnoses(replace(fitted, steps=(replace(step, declared=False),)))
+    steps = (replace(step, declared=False),)
+    after_search = description_diagnoses(replace(fitted, steps=steps))
     assert said(after_search) == {"zero-off J2"}
 
 
@@ -419,11 +437,15 @@ def test_a_zero_that_the_search_has_set_aside_is_named_and_one_in_its_noise_is_n
 ) -> None:
     runs = {run.name: run for run in recorded}
     monkeypatch.setattr(fit_module, "load_run", lambda path, *_: (runs[path.name], cell))
-    fitted = fit([Path(f"r{number}") for number in range(USED)])
-    finding = passed_finding(ZeroOffset(), 1, np.radians(-4.0), np.radians(0.1))
+    logs = [Path(f"r{number}") for number in range(USED)]
+    fitted = fit(logs)
+    std = np.radians(0.1)
+    finding = passed_finding(ZeroOffset(), 1, np.radians(-4.0), std)
     aside = SetAside(finding, "the squared error on runs left out rises")
-    step = Step((), (), np.zeros(3), None, fitted.evidence(), set_aside=(aside,))
-    (diagnosis,) = description_diagnoses(replace(fitted, steps=(step,)))
+    limits_nm = np.zeros(3)
+    step = Step((), (), limits_nm, None, fitted.evidence(), set_aside=(aside,))
+    changed_fitted = replace(fitted, steps=(step,))
+    (diagnosis,) = description_diagnoses(changed_fitted)
     assert (diagnosis.name, diagnosis.axes) == ("zero-off", ("J2",))
     assert "off by -4.00 ± 0.10°" in diagnosis.found
     assert (
@@ -432,15 +454,15 @@ def test_a_zero_that_the_search_has_set_aside_is_named_and_one_in_its_noise_is_n
     # Beside a delay that the moves do not tell from it, it is one diagnosis, and no number is to be
     # typed in.
     late = passed_finding(LatePosition(), 1, 0.002, 1e-4)
-    check = GeometryCheck(
-        gravity=None, mistakes=(), hidden_zeros=(), alike=(AlikeCorrections((finding, late), ()),)
-    )
+    alike = (AlikeCorrections((finding, late), ()),)
+    check = GeometryCheck(gravity=None, mistakes=(), hidden_zeros=(), alike=alike)
     (unclear,) = description_diagnoses(replace(fitted, steps=(step,), description=check))
     assert unclear.name == "correction-unclear"
     assert "the zero of J2 off by -4.00 ± 0.10°" in unclear.found
     assert "or the position of J2 late by 2.00 ± 0.10 ms" in unclear.found
     assert "correct nothing in the cell file before that" in unclear.remedy
-    in_its_noise = replace(step, left_open=(PlacedEffect(ZeroOffset(), 1),))
+    left_open = (PlacedEffect(ZeroOffset(), 1),)
+    in_its_noise = replace(step, left_open=left_open)
     assert description_diagnoses(replace(fitted, steps=(in_its_noise,))) == ()
 
 
@@ -448,24 +470,29 @@ def test_an_undecided_zero_is_named_and_refuses_the_gains_and_is_in_their_sigma(
     cell: Cell, recorded: Runs, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A held-out run of three seconds decides nothing."""
+    time_s = recorded[6].time_s
+    position_rad = recorded[6].position_rad
+    current_a = recorded[6].current_a
     short = replace(
         recorded[6],
-        time_s=recorded[6].time_s[:600],
-        position_rad=recorded[6].position_rad[:600],
-        current_a=recorded[6].current_a[:600],
+        time_s=time_s[:600],
+        position_rad=position_rad[:600],
+        current_a=current_a[:600],
     )
     runs = {run.name: replace(offset(run), digest=run.name) for run in (*recorded[:USED], short)}
     monkeypatch.setattr(fit_module, "load_run", lambda path, *_: (runs[path.name], cell))
     monkeypatch.setattr(fit_module, "find_effects", partial(find_effects, families=FEW_FAMILIES))
-    fitted = fit(
-        [Path(f"r{number}") for number in range(USED)], holdout=[Path("r6")], keep_rows=True
-    )
+    logs = [Path(f"r{number}") for number in range(USED)]
+    holdout = [Path("r6")]
+    fitted = fit(logs, holdout=holdout, keep_rows=True)
     closed = close_loop(fitted, 0)
-    assert closed.steps[-1].after.effects == ()
+    last_step = closed.steps[-1]
+    assert last_step.after.effects == ()
     (verdict,) = closed.steps[-1].verdicts
     assert verdict.judgement is Judgement.UNDECIDED
     named = [one for one in closed.diagnoses if one.name == "zero-off"]
-    assert [one.axes for one in named] == [("J2",)]
+    axes = [one.axes for one in named]
+    assert axes == [("J2",)]
     assert "held-out runs do not decide it" in named[0].found
     calibration = calibration_of(closed, WHEN)
     assert [one.name for one in uncorrected_description(calibration)] == ["zero-off"]
@@ -481,12 +508,14 @@ def test_a_zero_that_a_search_has_corrected_is_named_with_its_deviation(
     }
     monkeypatch.setattr(fit_module, "load_run", lambda path, *_: (runs[path.name], cell))
     monkeypatch.setattr(fit_module, "find_effects", partial(find_effects, families=FEW_FAMILIES))
-    fitted = fit([Path(f"r{number}") for number in range(USED)], keep_rows=True)
+    logs = [Path(f"r{number}") for number in range(USED)]
+    fitted = fit(logs, keep_rows=True)
     assert said(fitted.diagnoses) == {"zero-turned J2"}
     assert "gains and errors mean nothing until it is right" in fitted.diagnoses[0].remedy
     (found,) = close_loop(fitted, 0).diagnoses
     assert (found.name, found.axes) == ("zero-off", ("J2",))
-    number, deviation = re.findall(r"([-+]\d+\.\d+) ± (\d+\.\d+)", found.found)[0]
+    matches = re.findall(r"([-+]\d+\.\d+) ± (\d+\.\d+)", found.found)
+    number, deviation = matches[0]
     assert abs(float(number) + 35.0) < 4.0 * float(deviation) < 2.0
 
 
@@ -526,7 +555,8 @@ def test_what_is_said_of_another_run_leaves_the_gains_as_they_are() -> None:
         "position-reversed", ("held-out",), ("J2",), "a position", "another", "reverse it"
     )
     assert geometry_refusal((of_run,)) is None
-    refused = geometry_refusal((of_run, replace(of_run, runs=())))
+    diagnoses = (of_run, replace(of_run, runs=()))
+    refused = geometry_refusal(diagnoses)
     assert refused is not None
     assert str(refused).startswith("J2")
 
@@ -536,9 +566,9 @@ def test_a_lean_that_a_zero_explains_as_well_is_named_with_it_and_no_number_is_t
 ) -> None:
     truth = three_axes_truth()
     lean = np.radians(2.0)
-    leaning = replace(
-        truth, model=with_gravity(truth.model, 9.81 * np.array([np.sin(lean), 0.0, -np.cos(lean)]))
-    )
+    gravity_m_s2 = 9.81 * np.array([np.sin(lean), 0.0, -np.cos(lean)])
+    model = with_gravity(truth.model, gravity_m_s2)
+    leaning = replace(truth, model=model)
     rng = np.random.default_rng(8)
     less = np.array([0.06, 1.0, 1.0])  # J1 hardly moves
     runs: dict[str, Run] = {}
@@ -554,9 +584,11 @@ def test_a_lean_that_a_zero_explains_as_well_is_named_with_it_and_no_number_is_t
             rate_hz=500.0,
             bend=lambda q: q * less,
         )
-        runs[run.name] = replace(run, digest=f"{number:064x}")
+        digest = f"{number:064x}"
+        runs[run.name] = replace(run, digest=digest)
     monkeypatch.setattr(fit_module, "load_run", lambda path, *_: (runs[path.name], cell))
-    fitted = fit([Path(f"r{number}") for number in range(4)], gains_fixed=True)
+    logs = [Path(f"r{number}") for number in range(4)]
+    fitted = fit(logs, gains_fixed=True)
     (found,) = fitted.diagnoses
     assert (found.name, found.axes) == ("correction-unclear", ("J2",))
     assert "the zero of J2 off by" in found.found
@@ -564,18 +596,21 @@ def test_a_lean_that_a_zero_explains_as_well_is_named_with_it_and_no_number_is_t
     assert "these moves do not tell them apart" in found.found
     assert "record moves in which J1 turns further" in found.remedy
     assert not re.search(r"\d\.\d", found.remedy)
-    say_after_fit(calibration_of(fitted, WHEN), [], None)
+    calibration = calibration_of(fitted, WHEN)
+    say_after_fit(calibration, [], None)
     assert "Next: record the moves that CHECK asks for" in capsys.readouterr().err
 
 
 def test_each_hidden_zero_has_its_own_reason(cell: Cell) -> None:
     robot = three_axes_truth().model.robot
-    check = GeometryCheck(gravity=None, mistakes=(), hidden_zeros=(0, 1, 2))
+    hidden_zeros = (0, 1, 2)
+    check = GeometryCheck(gravity=None, mistakes=(), hidden_zeros=hidden_zeros)
     text = hidden_zeros_text(check, cell.axis_names, robot)
     assert "of J1: another one turns or shifts the whole arm" in text
     assert "of J3: no joint is behind it" in text
     assert "of J2: these moves do not show it" in text
-    assert hidden_zeros_text(replace(check, hidden_zeros=()), cell.axis_names, robot) == ""
+    changed_check = replace(check, hidden_zeros=())
+    assert hidden_zeros_text(changed_check, cell.axis_names, robot) == ""
 
 
 def test_the_key_that_is_named_reverses_a_position_and_no_current(
@@ -586,13 +621,17 @@ def test_the_key_that_is_named_reverses_a_position_and_no_current(
         for run in map(reversed_position, recorded)
     }
     monkeypatch.setattr(fit_module, "load_run", lambda path, *_: (runs[path.name], cell))
-    (diagnosis,) = fit([Path(f"r{number}") for number in range(USED)], keep_rows=True).diagnoses
+    logs = [Path(f"r{number}") for number in range(USED)]
+    (diagnosis,) = fit(logs, keep_rows=True).diagnoses
     assert (diagnosis.name, diagnosis.axes) == ("position-reversed", ("J2",))
     assert "the row of J2 in `drive_train.ratio`" in diagnosis.remedy
     declared = cell.ratio
     corrected = declared * np.array([1.0, -1.0, 1.0])[:, None]
     # The way from motor to joint turns for J2 alone, and the torque of a motor at its joint stays.
     counts = np.array([1.0, 2.0, 3.0])
-    turned_rad = np.linalg.inv(corrected) @ counts / (np.linalg.inv(declared) @ counts)
-    np.testing.assert_allclose(turned_rad, [1.0, -1.0, 1.0])
+    corrected_inverse = np.linalg.inv(corrected)
+    declared_inverse = np.linalg.inv(declared)
+    turned_rad = corrected_inverse @ counts / (declared_inverse @ counts)
+    expected = [1.0, -1.0, 1.0]
+    np.testing.assert_allclose(turned_rad, expected)
     np.testing.assert_allclose(DriveTrain(corrected).direction, DriveTrain(declared).direction)

@@ -21,10 +21,10 @@ EXPLAINED = ("cycles", "frames", "foreign")
 
 
 def cell_with(folder: Path, interface: str, pacing: str, producer: str | None) -> Path:
-    text = (CONFIGURATIONS / "cells" / "demo.yaml").read_text(encoding="utf-8")
-    text = text.replace("../", f"{CONFIGURATIONS}/").replace(
-        "interface: virtual", f"interface: {interface}"
-    )
+    demo_path = CONFIGURATIONS / "cells" / "demo.yaml"
+    text = demo_path.read_text(encoding="utf-8")
+    changed_text = text.replace("../", f"{CONFIGURATIONS}/")
+    text = changed_text.replace("interface: virtual", f"interface: {interface}")
     said = "" if producer is None else f"\n  producer: {producer}"
     path = folder / "cell.yaml"
     path.write_text(text.replace("pacing: lockstep ", f"pacing: {pacing}{said} "), encoding="utf-8")
@@ -44,7 +44,8 @@ def cell_with(folder: Path, interface: str, pacing: str, producer: str | None) -
 def test_a_producer_that_there_is(
     tmp_path: Path, interface: str, pacing: str, producer: str | None, expected: str
 ) -> None:
-    cell = load_cell(cell_with(tmp_path, interface, pacing, producer))
+    path = cell_with(tmp_path, interface, pacing, producer)
+    cell = load_cell(path)
     assert cell.sync is not None
     assert cell.sync.producer == expected
 
@@ -72,15 +73,17 @@ def test_a_producer_that_there_is(
 def test_a_producer_that_there_is_not(
     tmp_path: Path, interface: str, pacing: str, producer: str, message: str
 ) -> None:
+    path = cell_with(tmp_path, interface, pacing, producer)
     with pytest.raises(ConfigurationInconsistent, match=message):
-        load_cell(cell_with(tmp_path, interface, pacing, producer))
+        load_cell(path)
 
 
 @pytest.mark.parametrize("producer", ["kernel", "J3"])
 def test_the_stream_can_stop_the_sync_that_it_follows(
     tmp_path: Path, producer: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    cell = load_cell(cell_with(tmp_path, "socketcan", "timed", producer))
+    path = cell_with(tmp_path, "socketcan", "timed", producer)
+    cell = load_cell(path)
     sender = _sync_producer(cell, network_of(cell))
     assert isinstance(sender, KernelProducer | DriveProducer)
     monkeypatch.setattr(type(sender), "start", lambda _: None)
@@ -91,6 +94,7 @@ def test_the_stream_can_stop_the_sync_that_it_follows(
 
 @pytest.mark.parametrize("name", [field.name for field in fields(StreamStatistics)])
 def test_whatever_is_lost_makes_a_run_invalid(name: str) -> None:
-    reason = stream_losses(StreamStatistics(**{name: 3}))
+    statistics = StreamStatistics(**{name: 3})
+    reason = stream_losses(statistics)
     assert (not reason) == (name in EXPLAINED)
     assert not reason or reason.startswith("3 ")

@@ -37,7 +37,8 @@ def test_the_file_gives_the_errors_of_the_fit(
     assert output.err == ""
     found = json.loads(output.out)
     calibration = load_calibration(file)
-    assert found["axes"] == ["J1", "J2", "J3", "J4", "J5", "J6"]
+    expected = ["J1", "J2", "J3", "J4", "J5", "J6"]
+    assert found["axes"] == expected
     (entry,) = found["logs"]
     error = entry["relative_error_percent"]
     assert error["axes"] == pytest.approx(calibration.relative_error_percent.axes, rel=1e-6)
@@ -56,15 +57,17 @@ def test_text_and_picture(
     real: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file, log = real
-    assert (
-        main(["validate", str(file), str(log), "--pictures", str(tmp_path / "new" / "folder")]) == 0
-    )
+    folder_folder = tmp_path / "new" / "folder"
+    assert main(["validate", str(file), str(log), "--pictures", str(folder_folder)]) == 0
     text, said = capsys.readouterr()
     assert "Next:" not in said  # its gains were held fixed
     assert f"{load_calibration(file).relative_error_percent.total:.2f}" in text
     assert "seen by the fit" in text
-    assert text.splitlines()[-1] == f"Written: {tmp_path / 'new' / 'folder' / 'tx40.svg'}"
-    assert (tmp_path / "new" / "folder" / "tx40.svg").read_bytes().startswith(b"<svg")
+    expected = f"Written: {tmp_path / 'new' / 'folder' / 'tx40.svg'}"
+    last_line = text.splitlines()[-1]
+    assert last_line == expected
+    tx40_path = tmp_path / "new" / "folder" / "tx40.svg"
+    assert tx40_path.read_bytes().startswith(b"<svg")
     (tmp_path / "occupied").write_text("", encoding="utf-8")
     assert main(["validate", str(file), str(log), "--pictures", str(tmp_path / "occupied")]) == 1
     error = capsys.readouterr().err
@@ -77,9 +80,8 @@ def test_identified_gains_that_apply_refuses_are_not_applied_next(
 ) -> None:
     file, log = real
     held = load_calibration(file)
-    free = replace(
-        held, gains=tuple(replace(gain, std=0.01 * abs(gain.value)) for gain in held.gains)
-    )
+    gains = tuple(replace(gain, std=0.01 * abs(gain.value)) for gain in held.gains)
+    free = replace(held, gains=gains)
     save_calibration(free, tmp_path / "free.yaml")
     assert main(["validate", str(tmp_path / "free.yaml"), str(log)]) == 0
     said = capsys.readouterr().err
@@ -98,7 +100,8 @@ def test_the_next_step_names_the_cell_file_that_the_logs_carry(
     own = tmp_path / "mine/own.yaml"
     for file, kg in ((other, "4.59"), (own, "4.58")):
         file.parent.mkdir(parents=True)
-        file.write_text(shipped.replace("mass_kg: 4.59", f"mass_kg: {kg}"), encoding="utf-8")
+        changed_shipped = shipped.replace("mass_kg: 4.59", f"mass_kg: {kg}")
+        file.write_text(changed_shipped, encoding="utf-8")
     monkeypatch.chdir(tmp_path)
     fitted = replace(
         demo_calibration(),
@@ -109,7 +112,8 @@ def test_the_next_step_names_the_cell_file_that_the_logs_carry(
     assert cell_of(fitted, logs) == Path("mine/own.yaml")
     unknown = replace(fitted, recording_configuration_sha256=None)
     assert cell_of(unknown, logs) == Path("CELL")
-    assert cell_of(unknown, [Path("log.mcap")]) == Path("a/cells/demo.yaml")
+    cell = cell_of(unknown, [Path("log.mcap")])
+    assert cell == Path("a/cells/demo.yaml")
     # One that cannot be read is no reason to fail
     own.write_text("name: demo\nrobot:\n", encoding="utf-8")
     assert cell_of(fitted, logs) == Path("CELL")
@@ -119,12 +123,15 @@ def test_what_a_calibration_has_met_and_what_it_was_made_with(real: tuple[Path, 
     file, log = real
     calibration = load_calibration(file)
     (source,) = calibration.sources
-    changed = replace(
-        calibration, sources=(replace(source, role="holdout"),), configuration_sha256="0" * 64
-    )
+    sources = (replace(source, role="holdout"),)
+    configuration_sha256 = "0" * 64
+    changed = replace(calibration, sources=sources, configuration_sha256=configuration_sha256)
     (held_out,) = validate(changed, [log])
     assert (held_out.data_use, held_out.same_configuration) == (DataUse.HOLDOUT, False)
-    (new,) = validate(replace(calibration, sources=(replace(source, sha256="0" * 64),)), [log])
+    sha256 = "0" * 64
+    changed_source = replace(source, sha256=sha256)
+    changed_calibration = replace(calibration, sources=(changed_source,))
+    (new,) = validate(changed_calibration, [log])
     assert new.data_use is DataUse.NEW
     # Twice the same rows weigh the same.
     assert together((new, new)).total == pytest.approx(new.error.total)
@@ -135,9 +142,9 @@ def test_a_wrong_gain_shows_on_its_axis_alone(real: tuple[Path, Path]) -> None:
     calibration = load_calibration(file)
     first, *others = calibration.gains
     (right,) = validate(calibration, [log])
-    (wrong,) = validate(
-        replace(calibration, gains=(replace(first, value=1.2 * first.value), *others)), [log]
-    )
+    gains = (replace(first, value=1.2 * first.value), *others)
+    changed_calibration = replace(calibration, gains=gains)
+    (wrong,) = validate(changed_calibration, [log])
     # ‖1.2 Y − W χ‖/‖1.2 Y‖ with a residual that is nearly orthogonal to W χ.
     expected = np.hypot(100.0 * 0.2 / 1.2, right.error.axes[0] / 1.2)
     assert wrong.error.axes[0] == pytest.approx(expected, rel=0.05)
@@ -148,9 +155,10 @@ def test_the_filter_is_that_of_the_calibration(real: tuple[Path, Path]) -> None:
     file, log = real
     calibration = load_calibration(file)
     (as_fitted,) = validate(calibration, [log])
-    (slower,) = validate(
-        replace(calibration, filter={**calibration.filter, "decimation_cutoff_hz": 5.0}), [log]
+    changed_calibration = replace(
+        calibration, filter={**calibration.filter, "decimation_cutoff_hz": 5.0}
     )
+    (slower,) = validate(changed_calibration, [log])
     assert len(slower.time_s) < 0.3 * len(as_fitted.time_s)
     assert slower.error.total < as_fitted.error.total
 
@@ -162,8 +170,9 @@ def test_the_filter_is_that_of_the_calibration(real: tuple[Path, Path]) -> None:
 def test_a_calibration_without_its_filter_is_unreadable(
     spoilt: dict[str, float | list[float]],
 ) -> None:
+    calibration = replace(demo_calibration(), filter=spoilt)
     with pytest.raises(CalibrationUnreadable, match="position_cutoff_hz"):
-        conditioning_of(replace(demo_calibration(), filter=spoilt))
+        conditioning_of(calibration)
 
 
 @pytest.fixture
@@ -188,14 +197,17 @@ def test_refusals_have_their_exit_codes(
     complete: Calibration, checkout: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     angle = np.rint(20000.0 * np.sin(np.arange(3000)[:, None] / 200.0 + np.arange(6))).astype(int)
-    log = write(tmp_path / "a.mcap", demo_content(checkout), samples(angle.tolist()))
-    assert main([*_calibrated(replace(complete, cell="other"), tmp_path), str(log)]) == 4
+    path = tmp_path / "a.mcap"
+    log = write(path, demo_content(checkout), samples(angle.tolist()))
+    calibration = replace(complete, cell="other")
+    assert main([*_calibrated(calibration, tmp_path), str(log)]) == 4
     assert "cell 'other' with the axes J1" in capsys.readouterr().err
     assert main([*_calibrated(complete, tmp_path), str(log), "--json"]) == 4
     output = capsys.readouterr()
     assert output.out == ""
     assert "'ZZ1R'" in output.err
-    assert main([*_calibrated(replace(complete, parameters=()), tmp_path), str(log)]) == 0
+    changed_complete = replace(complete, parameters=())
+    assert main([*_calibrated(changed_complete, tmp_path), str(log)]) == 0
     assert "100.00" in capsys.readouterr().out  # a model without parameters predicts nothing
     assert main([*_calibrated(complete, tmp_path), str(tmp_path / "none.mcap")]) == 4
     assert "none.mcap" in capsys.readouterr().err
@@ -206,8 +218,10 @@ def test_refusals_have_their_exit_codes(
 def test_a_robot_that_was_at_rest_reports_nothing(
     complete: Calibration, checkout: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    log = write(tmp_path / "still.mcap", demo_content(checkout), samples([[0] * 6] * 3000))
-    assert main([*_calibrated(replace(complete, parameters=()), tmp_path), str(log)]) == 4
+    path = tmp_path / "still.mcap"
+    log = write(path, demo_content(checkout), samples([[0] * 6] * 3000))
+    calibration = replace(complete, parameters=())
+    assert main([*_calibrated(calibration, tmp_path), str(log)]) == 4
     assert "did the robot move" in capsys.readouterr().err
 
 
@@ -223,6 +237,7 @@ def test_a_run_without_the_temperature_that_an_effect_needs_is_warned_of(
         warn_without_temperature(calibration, "monday", temperature_c)
         assert "monday has no temperature of J2: its friction is predicted at 40 °C" in caplog.text
     caplog.clear()
-    warn_without_temperature(calibration, "monday", bare + 30.0)
+    bare_temperature_c = bare + 30.0
+    warn_without_temperature(calibration, "monday", bare_temperature_c)
     warn_without_temperature(demo_calibration(), "monday", None)
     assert not caplog.records

@@ -32,9 +32,12 @@ MOVE = PlannedMove(RIGHT, 0.9, 0.8, 0.5)
 @pytest.fixture(scope="module")
 def walled(checkout: Path) -> Cell:
     """The demo cell with a wall in front of the arm."""
-    wall = Box("wall", (0.3, -0.05, 0.0), (0.6, 0.05, 1.0))
+    lower_m = (0.3, -0.05, 0.0)
+    upper_m = (0.6, 0.05, 1.0)
+    wall = Box("wall", lower_m, upper_m)
+    path = checkout / "configs/cells/demo.yaml"
     return replace(
-        load_cell(checkout / "configs/cells/demo.yaml"),
+        load_cell(path),
         clearance=Clearance(None, 0.02, (), (wall,)),
     )
 
@@ -47,13 +50,15 @@ def _plan_to(*targets: tuple[float, ...]) -> Plan:
 def test_a_clear_straight_way_needs_no_further_move(walled: Cell) -> None:
     beside = (1.0, *LEFT[1:])
     straight = _plan_to(beside)
-    assert way_to_first_target(walled, straight, np.array(LEFT)) == (straight.moves, "")
+    start_rad = np.array(LEFT)
+    assert way_to_first_target(walled, straight, start_rad) == (straight.moves, "")
 
 
 def test_nothing_is_asked_where_the_cell_file_says_nothing_of_the_room(walled: Cell) -> None:
     bare = replace(walled, clearance=None)
     straight = _plan_to(RIGHT)
-    assert way_to_first_target(bare, straight, np.array(LEFT)) == (straight.moves, "")
+    start_rad = np.array(LEFT)
+    assert way_to_first_target(bare, straight, start_rad) == (straight.moves, "")
 
 
 def test_a_wall_that_no_position_of_the_plan_leads_around_is_refused(walled: Cell) -> None:
@@ -68,19 +73,23 @@ def test_a_wall_that_no_position_of_the_plan_leads_around_is_refused(walled: Cel
 
 def test_slow_moves_lead_around_a_wall_between_the_positions_of_the_plan(walled: Cell) -> None:
     plan_ = _plan_to(RIGHT, ABOVE)
-    moves, remark = way_to_first_target(walled, plan_, np.array(LEFT))
+    start_rad = np.array(LEFT)
+    moves, remark = way_to_first_target(walled, plan_, start_rad)
     assert len(moves) > 1
     assert moves[-1].target_rad == RIGHT
     robot = robot_from_urdf(walled.urdf)
     scene = scene_of(walled, robot, 1.0).checker.scene
     # That a guessed arm touches itself refuses nothing
-    checker = Checker(robot, replace(scene, pairs=()))
+    changed_scene = replace(scene, pairs=())
+    checker = Checker(robot, changed_scene)
     way = np.array([LEFT, *(move.target_rad for move in moves)])
     for start, end in pairwise(way):
         assert checker.obstruction(start, end) is None
     corners = np.array([LEFT, RIGHT, ABOVE])
-    assert np.all(way >= corners.min(axis=0))
-    assert np.all(way <= corners.max(axis=0))
+    smallest_corner = corners.min(axis=0)
+    assert np.all(way >= smallest_corner)
+    largest_corner = corners.max(axis=0)
+    assert np.all(way <= largest_corner)
     assert {(move.velocity, move.acceleration) for move in moves} == {(AROUND_SHARE, AROUND_SHARE)}
     assert "slow moves led around it, by " in remark
 
@@ -108,4 +117,5 @@ def test_the_next_plan_of_a_closed_chain_begins_where_the_last_one_ended(checkou
 
 
 def _end_of(plan_: Plan) -> np.ndarray:
-    return np.array(plan_.moves[-1].target_rad)
+    last_move = plan_.moves[-1]
+    return np.array(last_move.target_rad)

@@ -38,11 +38,13 @@ def test_a_real_robot_that_touched_nothing(
     assert main(["contact", str(log), *options, "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["band_from_this_log"]
-    assert [axis["axis"] for axis in found["axes"]] == ["J1", "J2", "J3", "J4", "J5", "J6"]
+    expected = ["J1", "J2", "J3", "J4", "J5", "J6"]
+    assert [axis["axis"] for axis in found["axes"]] == expected
     for axis in found["axes"]:
         assert 0.0 < axis["band"] < axis["threshold"]
     assert found["contacts"] == []
-    assert Path(found["picture"]).read_bytes().startswith(b"\x89PNG")
+    path = Path(found["picture"])
+    assert path.read_bytes().startswith(b"\x89PNG")
 
 
 def test_a_log_is_not_its_own_quiet_motion(
@@ -63,7 +65,8 @@ def test_quiet_motion_that_the_fit_has_seen_is_warned_of(caplog: pytest.LogCaptu
         Run(name, np.arange(4.0), rest, rest, digest=key * 64)
         for name, key in (("seen", "a"), ("held", "d"))
     ]
-    assert warn_of_fitted(calibration, runs[1:], "no matter") == ()
+    warn = warn_of_fitted(calibration, runs[1:], "no matter")
+    assert warn == ()
     assert caplog.messages == []
     assert warn_of_fitted(calibration, runs, "no proof") == ("seen",)
     assert caplog.messages == ["seen was part of the fit: no proof"]
@@ -81,7 +84,8 @@ def test_a_real_flange_without_a_body_weighs_nothing(
     assert abs(mass) < 3.0 * std < 0.3
     assert caplog.messages[0].startswith("tx40 was part of the fit: the agreement proves nothing")
     assert main(["weigh", str(log), "--calibration", str(file), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["part_of_the_fit"] == ["tx40"]
+    document = json.loads(capsys.readouterr().out)
+    assert document["part_of_the_fit"] == ["tx40"]
 
 
 @pytest.mark.parametrize("verb", ["weigh", "contact"])
@@ -128,15 +132,18 @@ def test_a_log_that_declares_a_payload_is_not_bare(
     axes = tuple(
         replace(gain, axis=f"J{index + 1}") for index, gain in enumerate(calibration.gains)
     )
-    save_calibration(replace(calibration, cell="demo", gains=axes), tmp_path / "calibration.yaml")
+    changed_calibration = replace(calibration, cell="demo", gains=axes)
+    save_calibration(changed_calibration, tmp_path / "calibration.yaml")
     angle = np.rint(20000.0 * np.sin(np.arange(2500)[:, None] / 200.0 + np.arange(6))).astype(int)
-    log = str(write(tmp_path / "a.mcap", demo_content(checkout, DISC), samples(angle.tolist())))
+    path = tmp_path / "a.mcap"
+    log = str(write(path, demo_content(checkout, DISC), samples(angle.tolist())))
     known = ["--calibration", str(tmp_path / "calibration.yaml")]
     assert main(["weigh", log, "--bare", log, *known]) == 4
     assert "found:    payload 'disc'" in capsys.readouterr().err
     assert main(["weigh", log, log, *known]) == 4
     assert "found:    the same log twice" in capsys.readouterr().err
-    bare = str(write(tmp_path / "b.mcap", demo_content(checkout), samples((angle + 1).tolist())))
+    b_path = tmp_path / "b.mcap"
+    bare = str(write(b_path, demo_content(checkout), samples((angle + 1).tolist())))
     for logs, mixed in (([bare, log], log), ([log, bare], bare)):
         assert main(["weigh", *logs, *known]) == 4
         said = capsys.readouterr().err
@@ -162,10 +169,12 @@ def test_a_weighed_body_is_shown_with_what_would_help(checkout: Path) -> None:
     std = np.where(np.isnan(ten), np.nan, 0.01)
     covariance = np.diag(std**2)
     scale = Scale.__new__(Scale)
-    error = RelativeError((2.0,) * 6, 2.0)
+    axes = (2.0,) * 6
+    error = RelativeError(axes, 2.0)
     body = WeighedBody(ten, covariance, covariance, False, 20, error, scale)
     helped = Help("mz", "fast moves of all axes", 5.0, 0.004)
-    found = Weighed(cell, (Path("a.mcap"),), (), body, (helped,), 4.59)
+    logs = (Path("a.mcap"),)
+    found = Weighed(cell, logs, (), body, (helped,), 4.59)
     text = _text(weighed_view(found))
     assert "4.600 ± 0.010" in text
     assert "+0.22 %" in text
@@ -183,11 +192,13 @@ def test_a_weighed_body_is_shown_with_what_would_help(checkout: Path) -> None:
     assert "tolerance" not in text
     assert report.mass_std_of_reference_kg == 0.0
     reference = np.full((10, 10), 1e-6)
-    tolerant = replace(found, body=replace(body, reference_covariance=reference))
+    changed_body = replace(body, reference_covariance=reference)
+    tolerant = replace(found, body=changed_body)
     assert ("with the tolerance of the calibration's payload mass") in " ".join(
         _text(weighed_view(tolerant)).split()
     )
-    assert weigh_report(tolerant).mass_std_of_reference_kg == pytest.approx(0.001)
+    mass_std_of_reference_kg = weigh_report(tolerant).mass_std_of_reference_kg
+    assert mass_std_of_reference_kg == pytest.approx(0.001)
     nothing = replace(found, body=replace(body, values=np.full(10, 0.001)), declared_kg=None)
     assert "No body shows" in _text(weighed_view(nothing))
 
@@ -201,18 +212,21 @@ def test_the_centre_is_shown_in_the_platforms_frame_too(checkout: Path) -> None:
     std = np.where(np.isnan(ten), np.nan, 0.02)
     std[5] = 0.2
     covariance = np.diag(std**2)
-    body = WeighedBody(
-        ten, covariance, covariance, True, 20, RelativeError((2.0,) * 2, 2.0), Scale.__new__(Scale)
-    )
-    found = Weighed(cell, (Path("a.mcap"),), (), body, (), 5.0)
+    axes = (2.0,) * 2
+    error = RelativeError(axes, 2.0)
+    body = WeighedBody(ten, covariance, covariance, True, 20, error, Scale.__new__(Scale))
+    logs = (Path("a.mcap"),)
+    found = Weighed(cell, logs, (), body, (), 5.0)
     text = _text(weighed_view(found))
     assert re.search(r"centre x +432\.0 ± 4\.4 +mm", text)
     assert re.search(r"centre x in plate +-18\.0 ± 4\.4 +mm", text)
     assert "Not identifiable with a σ: it is more than 10 % of the value" in text
     in_platform = weigh_report(found).centre_in_platform_m
     assert in_platform is not None
-    assert in_platform.value == [pytest.approx(-0.018), pytest.approx(0.03), None]
-    serial = replace(found, cell=load_cell(checkout / "configs/cells/demo.yaml"))
+    expected = [pytest.approx(-0.018), pytest.approx(0.03), None]
+    assert in_platform.value == expected
+    path = checkout / "configs/cells/demo.yaml"
+    serial = replace(found, cell=load_cell(path))
     assert weigh_report(serial).centre_in_platform_m is None
     assert " in " not in _text(weighed_view(serial)).partition("In the frame")[0]
 
@@ -221,10 +235,13 @@ def test_a_platform_that_only_translates_shows_a_mass_alone(checkout: Path) -> N
     cell = load_cell(checkout / "configs/cells/five-bar.yaml")
     ten = np.array([np.nan] * 9 + [5.0])
     covariance = np.diag(np.where(np.isnan(ten), np.nan, 0.02) ** 2)
-    body = WeighedBody(
-        ten, covariance, covariance, True, 20, RelativeError((2.0,) * 2, 2.0), Scale.__new__(Scale)
-    )
-    lines = _text(weighed_view(Weighed(cell, (Path("a.mcap"),), (), body, (), 5.0))).splitlines()
+    axes = (2.0,) * 2
+    error = RelativeError(axes, 2.0)
+    body = WeighedBody(ten, covariance, covariance, True, 20, error, Scale.__new__(Scale))
+    logs = (Path("a.mcap"),)
+    weighed = Weighed(cell, logs, (), body, (), 5.0)
+    parts = weighed_view(weighed)
+    lines = _text(parts).splitlines()
     assert lines[0].strip() == "Body on the platform"
     assert "The platform does not turn in these moves: centre and inertia cannot be seen." in lines
     assert not any(line.startswith(("centre", "Ixx", "parameter")) for line in lines)
@@ -234,12 +251,14 @@ def test_contacts_are_listed(checkout: Path) -> None:
     cell = load_cell(checkout / "configs/cells/demo.yaml")
     one = np.ones(6)
     even = np.ones((6, 500))
-    band = Band(
-        np.ones((6, 4)), 2.0 * one, np.array([5.0] * 5 + [np.nan]), 0.05 * one, 40.0 * one, 1.0
-    )
+    threshold = np.array([5.0] * 5 + [np.nan])
+    correlation_s = 0.05 * one
+    quiet_s = 40.0 * one
+    band = Band(np.ones((6, 4)), 2.0 * one, threshold, correlation_s, quiet_s, 1.0)
     torque = 0.5 * even
     torque[2, 100:140] = -9.0
-    found = ExternalTorque(np.linspace(0.0, 9.98, 500), torque, even, even > 0.0, band, True, 1)
+    time_s = np.linspace(0.0, 9.98, 500)
+    found = ExternalTorque(time_s, torque, even, even > 0.0, band, True, 1)
     text = _text(contact_view(found, cell))
     assert "J3" in text
     assert "1.80" in text
@@ -247,7 +266,8 @@ def test_contacts_are_listed(checkout: Path) -> None:
     assert "J6 not judged: 40 s of quiet motion have too few separate peaks; record longer." in text
     report = contact_report(found, cell, Path("a.mcap"), None)
     (contact,) = report.contacts
-    assert (contact.axis, contact.peak, contact.peak_over_threshold) == ("J3", -9.0, 1.8)
+    expected = ("J3", -9.0, 1.8)
+    assert (contact.axis, contact.peak, contact.peak_over_threshold) == expected
     assert (contact.start_s, contact.end_s) == pytest.approx((2.0, 2.78))
     assert [one.axis for one in report.not_judged] == ["J6"]
 
@@ -262,7 +282,8 @@ def test_no_contact_is_said_of_judged_axes_alone(checkout: Path) -> None:
     band = Band(np.ones((6, 4)), 2.0 * one, threshold, correlation_s, quiet_s, 1.0)
     use = even > 0.0
     use[3] = False
-    found = ExternalTorque(np.linspace(0.0, 9.98, 500), even, even, use, band, False, 0)
+    time_s = np.linspace(0.0, 9.98, 500)
+    found = ExternalTorque(time_s, even, even, use, band, False, 0)
     text = _text(contact_view(found, cell))
     assert "No contact on J1, J5, J6." in text
     assert "J2 not judged: its residual stays on one side for 1.5 s at a time" in text
@@ -270,7 +291,10 @@ def test_no_contact_is_said_of_judged_axes_alone(checkout: Path) -> None:
     assert "J4 not judged: it does not move in this log." in text
     listed = contact_report(found, cell, Path("a.mcap"), None).not_judged
     assert [entry.axis for entry in listed] == ["J2", "J3", "J4"]
-    blind = replace(found, use=np.zeros_like(use))
-    assert "No contact" not in _text(contact_view(blind, cell))
-    judged = replace(found, use=even > 0.0, band=replace(band, threshold=5.0 * one))
+    zero_use = np.zeros_like(use)
+    blind = replace(found, use=zero_use)
+    parts = contact_view(blind, cell)
+    assert "No contact" not in _text(parts)
+    changed_band = replace(band, threshold=5.0 * one)
+    judged = replace(found, use=even > 0.0, band=changed_band)
     assert "No contact.\n" in _text(contact_view(judged, cell))

@@ -38,9 +38,8 @@ def _by_encoders(value_rad: float) -> GeometryFinding:
     """A finding by redundant encoders, of the second axis of a closed chain."""
     parameter = GeometryParameter(GeometryKind.ZERO, "crank-2")
     correction = GeometryEstimate(parameter, value_rad, radians(STD_DEG))
-    return GeometryFinding(
-        4e-4, 6e-6, 5e-6, True, (correction,), np.array([[radians(STD_DEG) ** 2]]), (), (), ()
-    )
+    covariance = np.array([[radians(STD_DEG) ** 2]])
+    return GeometryFinding(4e-4, 6e-6, 5e-6, True, (correction,), covariance, (), (), ())
 
 
 @pytest.mark.parametrize("too_large_deg", DECLARED_TOO_LARGE_DEG)
@@ -59,12 +58,16 @@ def test_a_zero_has_one_sign_by_torque_by_encoders_and_on_the_certificate(
     )
 
     serial = load_cell(checkout / "configs/cells/demo.yaml")
-    declared = replace(serial.axes[1], zero_offset_rad=radians(right_deg + too_large_deg))
-    serial = replace(serial, axes=(serial.axes[0], declared, *serial.axes[2:]))
-    check = GeometryCheck(gravity=None, mistakes=(_by_torque(value_rad),), hidden_zeros=())
+    zero_offset_rad = radians(right_deg + too_large_deg)
+    declared = replace(serial.axes[1], zero_offset_rad=zero_offset_rad)
+    axes = (serial.axes[0], declared, *serial.axes[2:])
+    serial = replace(serial, axes=axes)
+    mistakes = (_by_torque(value_rad),)
+    check = GeometryCheck(gravity=None, mistakes=mistakes, hidden_zeros=())
     (by_torque,) = check_diagnoses(check, serial, model_of(serial))
     name = declared.name
-    assert by_torque.found == f"the zero of {name} off by {said}"
+    expected = f"the zero of {name} off by {said}"
+    assert by_torque.found == expected
     assert by_torque.remedy.startswith(typed.format(name))
 
     closed = load_cell(checkout / "configs/cells/dualv.yaml")
@@ -97,8 +100,11 @@ def test_a_zero_of_a_serial_arm_may_be_a_length(
     checkout: Path, name: str, *, is_serial: bool
 ) -> None:
     """A closed chain has encoders that contradict a length; a serial arm has not."""
-    cell = load_cell(checkout / "configs" / "cells" / f"{name}.yaml")
+    cells_folder = checkout / "configs" / "cells"
+    path = cells_folder / f"{name}.yaml"
+    cell = load_cell(path)
     placed = PlacedEffect(ZeroOffset(), 1)
-    said = _correction_diagnosis(placed, np.array([0.02]), np.array([0.001]), cell, model_of(cell))
+    deviations = np.array([0.001])
+    said = _correction_diagnosis(placed, np.array([0.02]), deviations, cell, model_of(cell))
     assert said.name == "zero-off"
     assert ("measure the lengths of the links in the URDF" in said.remedy) == is_serial

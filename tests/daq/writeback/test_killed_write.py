@@ -54,12 +54,17 @@ the lock file without a holder, unfinished copies.
 def _request(gain: float) -> Request:
     """A calibration of this gain, with the bytes of its file: these take long to make."""
     calibration = demo_calibration()
+    changed_gain = replace(calibration.gains[0], value=gain, std=0.1)
+    gains = (changed_gain,)
+    relative_error_percent = RelativeError((3.1,), 3.1)
+    holdout_error_percent = RelativeError((3.2,), 3.2)
+    relative_error = RelativeError((4.2,), 4.2)
     calibration = replace(
         calibration,
-        gains=(replace(calibration.gains[0], value=gain, std=0.1),),
-        relative_error_percent=RelativeError((3.1,), 3.1),
-        holdout_error_percent=RelativeError((3.2,), 3.2),
-        nameplate_holdout_error_percent=RelativeError((4.2,), 4.2),
+        gains=gains,
+        relative_error_percent=relative_error_percent,
+        holdout_error_percent=holdout_error_percent,
+        nameplate_holdout_error_percent=relative_error,
     )
     return Request(calibration, NOW, content=encode_calibration(calibration))
 
@@ -84,13 +89,16 @@ class Place:
 
     def apply(self, gain: float, minutes: int = 0) -> None:
         """Write a gain."""
-        proposal = propose(FileTarget(self.file, KEYS), _request(gain))
+        target = FileTarget(self.file, KEYS)
+        proposal = propose(target, _request(gain))
         assert proposal.refusals == ()
-        apply(proposal, NOW + timedelta(minutes=minutes), audit=self.audit, who="Ada")
+        now = NOW + timedelta(minutes=minutes)
+        apply(proposal, now, audit=self.audit, who="Ada")
 
     def to_apply(self) -> Callable[[], object]:
         """The write itself, everything before it done: another gain goes in."""
-        proposal = propose(FileTarget(self.file, KEYS), _request(33.9))
+        target = FileTarget(self.file, KEYS)
+        proposal = propose(target, _request(33.9))
         return lambda: apply(proposal, NOW + timedelta(minutes=1), audit=self.audit, who="Ada")
 
     def to_roll_back(self) -> Callable[[], object]:
@@ -200,7 +208,8 @@ def test_killed_at_every_system_call_the_file_is_old_or_new_and_the_audit_report
         sys.stdout.write(f"\n  {states} states of the files at {calls} system calls, {remains}\n")
     assert calls >= MIN_CALLS
     assert states >= MIN_STATES
-    assert set(outcomes) == {Content.BEFORE, Content.AFTER}
+    expected = {Content.BEFORE, Content.AFTER}
+    assert set(outcomes) == expected
     # Otherwise no writer was killed half-way.
     assert {"lock", "tmp"} <= left
 
@@ -234,7 +243,8 @@ def _kill_everywhere(
             # audit names the file.
             shutil.rmtree(place.folder)
             shutil.copytree(kept, place.folder)
-            killed_where(partial(_is_reached, place, state), work(place))
+            here = partial(_is_reached, place, state)
+            killed_where(here, work(place))
             assert place.state() == state
             outcomes[_check(place, before, after)] += 1
             left |= place.kinds_left()
@@ -268,7 +278,8 @@ def _check(place: Place, before: bytes | None, after: bytes | None) -> Content:
     assert content in {before, after}
     if content is not None:
         decode_document(content, "x.yaml").locate(tuple(KEYS.values()))
-        assert stat.S_IMODE(place.file.stat().st_mode) == 0o640
+        st_mode = place.file.stat().st_mode
+        assert stat.S_IMODE(st_mode) == 0o640
     verdict = verify(place.audit)
     assert verdict.holds
     reported = _reported_content(verdict)
@@ -281,23 +292,21 @@ def _check(place: Place, before: bytes | None, after: bytes | None) -> Content:
 def _check_next_write(place: Place, before: bytes | None, after: bytes | None) -> None:
     """The next writer is not hindered, and the audit still records what the killed one has done."""
     was = place.content()
-    reported = [one.content for one in verify(place.audit).open_writes]
+    open_writes = verify(place.audit).open_writes
+    reported = [one.content for one in open_writes]
     if was is None:
-        assert (
-            rollback(
-                FileTarget(place.file), NOW + timedelta(minutes=2), audit=place.audit
-            ).edit.after
-            == after
-        )
-        assert [one.content for one in verify(place.audit).open_writes] == reported
+        now = NOW + timedelta(minutes=2)
+        file_target = FileTarget(place.file)
+        assert rollback(file_target, now, audit=place.audit).edit.after == after
+        contents = [one.content for one in verify(place.audit).open_writes]
+        assert contents == reported
         return
     place.apply(31.5, minutes=2)
     assert b"31.5" in place.file.read_bytes()
     verdict = verify(place.audit)
     assert verdict.holds
     assert [one.content for one in verdict.open_writes] == reported
-    assert (
-        rollback(FileTarget(place.file), NOW + timedelta(minutes=3), audit=place.audit).edit.after
-        == was
-    )
+    target = FileTarget(place.file)
+    edit = rollback(target, NOW + timedelta(minutes=3), audit=place.audit).edit
+    assert edit.after == was
     assert place.file.read_bytes() in {before, after}

@@ -99,7 +99,9 @@ def test_minisigns_own_files_are_read_and_written_alike() -> None:
     minisign.check_signature(key.public, theirs, CONTENT)
     # Ed25519 is deterministic: the same key, content and comment have one signature.
     assert key.sign(CONTENT, "made by minisign 0.11") == theirs
-    assert key.text("", b"").splitlines()[1] == SECRET.splitlines()[1]
+    lines = key.text("", b"").splitlines()
+    expected = SECRET.splitlines()[1]
+    assert lines[1] == expected
     assert theirs.text.splitlines()[1:] == SIGNATURE.splitlines()[1:]
 
 
@@ -119,21 +121,25 @@ def test_scrypts_parameters_are_picked_as_libsodium_does(
 
 
 def test_a_signature_beside_the_file_is_found(calibration: Path) -> None:
-    secret, public = generate(calibration.parent / "keys", "anna")
-    _, other = generate(calibration.parent / "keys", "bert")
+    folder = calibration.parent / "keys"
+    secret, public = generate(folder, "anna")
+    keys_folder = calibration.parent / "keys"
+    _, other = generate(keys_folder, "bert")
     trusted = {"bert": other.line, "anna": public.line}
     assert signers_of(calibration, trusted) == ()
     path = sign(calibration, secret, "anna", at=NOW)
     assert path == signature_path(calibration, "anna")
     assert signers_of(calibration, trusted) == ("anna",)
-    reported = minisign.parse_signature(path.read_text()).comment.split("\t")
-    assert reported == [
+    signature = minisign.parse_signature(path.read_text())
+    reported = signature.comment.split("\t")
+    expected = [
         "timestamp:1735787045",
         "at:2025-01-02T03:04:05+00:00",
         "file:calibration.yaml",
         "signer:anna",
         "hashed",
     ]
+    assert reported == expected
 
 
 def test_an_untrusted_signer_is_not_considered(calibration: Path) -> None:
@@ -141,7 +147,8 @@ def test_an_untrusted_signer_is_not_considered(calibration: Path) -> None:
     sign(calibration, secret, "mallory", at=NOW)
     signature_path(calibration, "someone").write_text("nonsense")
     _, public = generate(calibration.parent, "anna")
-    assert signers_of(calibration, {"anna": public.line}) == ()
+    trusted = {"anna": public.line}
+    assert signers_of(calibration, trusted) == ()
 
 
 @settings(max_examples=60, deadline=None)
@@ -150,8 +157,9 @@ def test_every_changed_bit_of_the_content_is_noticed(place: int, bit: int) -> No
     key = minisign.parse_secret_key(SECRET)
     changed = bytearray(CONTENT)
     changed[place % len(CONTENT)] ^= 1 << bit
+    signature = minisign.parse_signature(SIGNATURE)
     with pytest.raises(ValueError, match="other content"):
-        minisign.check_signature(key.public, minisign.parse_signature(SIGNATURE), bytes(changed))
+        minisign.check_signature(key.public, signature, bytes(changed))
 
 
 @settings(max_examples=200, deadline=None)
@@ -222,15 +230,17 @@ def test_what_was_read_is_what_is_checked(calibration: Path) -> None:
     sign(calibration, secret, "anna", at=NOW)
     read = calibration.read_bytes()
     calibration.write_bytes(b"exchanged after it was read")
-    assert signers_of(calibration, {"anna": public.line}, read) == ("anna",)
+    trusted = {"anna": public.line}
+    assert signers_of(calibration, trusted, read) == ("anna",)
     with pytest.raises(SignatureInvalid):
         signers_of(calibration, {"anna": public.line})
 
 
 def test_two_names_with_one_key_are_no_two_persons(calibration: Path) -> None:
     _, public = generate(calibration.parent, "anna")
+    trusted = {"anna": public.line, "bert": public.line}
     with pytest.raises(ConfigurationInconsistent, match="the key of anna"):
-        signers_of(calibration, {"anna": public.line, "bert": public.line})
+        signers_of(calibration, trusted)
 
 
 @pytest.mark.parametrize(
@@ -249,7 +259,8 @@ def test_a_secret_key_is_its_owners_alone_and_never_replaced(tmp_path: Path) -> 
         secret, public = generate(tmp_path, "anna")
     finally:
         os.umask(old)
-    assert stat.S_IMODE(secret.stat().st_mode) == 0o600
+    st_mode = secret.stat().st_mode
+    assert stat.S_IMODE(st_mode) == 0o600
     before = secret.read_bytes()
     with pytest.raises(UsageError, match="keys are not replaced"):
         generate(tmp_path, "anna")
@@ -259,8 +270,10 @@ def test_a_secret_key_is_its_owners_alone_and_never_replaced(tmp_path: Path) -> 
         generate(tmp_path, "anna")
     assert not secret.exists()
     secret.write_bytes(before)
-    assert public.line in secret.with_suffix(".pub").read_text()
-    assert "seed" not in repr(minisign.parse_secret_key(before.decode()))
+    text = secret.with_suffix(".pub").read_text()
+    assert public.line in text
+    secret_key = minisign.parse_secret_key(before.decode())
+    assert "seed" not in repr(secret_key)
 
 
 def test_a_key_without_a_password_that_others_may_read_signs_nothing(calibration: Path) -> None:
@@ -271,7 +284,8 @@ def test_a_key_without_a_password_that_others_may_read_signs_nothing(calibration
     locked, public = generate(calibration.parent, "bert", "a password")
     locked.chmod(0o644)  # as on a stick without rights
     sign(calibration, locked, "bert", password="a password")
-    assert signers_of(calibration, {"bert": public.line}) == ("bert",)
+    trusted = {"bert": public.line}
+    assert signers_of(calibration, trusted) == ("bert",)
 
 
 def test_a_password_protects_the_key(calibration: Path) -> None:
@@ -285,15 +299,17 @@ def test_a_password_protects_the_key(calibration: Path) -> None:
             sign(calibration, secret, "anna", password=wrong)
     assert not signature_path(calibration, "anna").exists()
     sign(calibration, secret, "anna", password="grüne Bohne")
-    assert signers_of(calibration, {"anna": public.line}) == ("anna",)
+    trusted = {"anna": public.line}
+    assert signers_of(calibration, trusted) == ("anna",)
 
 
 def test_a_key_that_asks_for_too_much_memory_is_refused() -> None:
     packed = bytearray(base64.b64decode(SECRET.splitlines()[1]))
     packed[2:4] = b"Sc"
     packed[38:54] = (2**30).to_bytes(8, "little") + (2**40).to_bytes(8, "little")
+    text = base64.b64encode(packed).decode()
     with pytest.raises(ValueError, match="asks for"):
-        minisign.parse_secret_key(base64.b64encode(packed).decode(), "password")
+        minisign.parse_secret_key(text, "password")
 
 
 @pytest.mark.parametrize("name", ["", "../anna", "a/b", ".hidden", "a b", "a\n", "x" * 65])
@@ -306,13 +322,16 @@ def test_a_name_is_part_of_a_file_name(calibration: Path, name: str) -> None:
 
 def test_whatever_is_not_there_or_in_the_way_is_reported(calibration: Path) -> None:
     secret, public = generate(calibration.parent, "anna")
-    for absent in (calibration.parent / "missing.key", secret.with_suffix(".pub")):
+    missing_path = calibration.parent / "missing.key"
+    for absent in (missing_path, secret.with_suffix(".pub")):
         with pytest.raises(UsageError, match="a secret key of"):
             sign(calibration, absent, "anna")
+    file = calibration.parent / "none.yaml"
     with pytest.raises(CalibrationMissing):
-        sign(calibration.parent / "none.yaml", secret, "anna")
+        sign(file, secret, "anna")
+    none_path = calibration.parent / "none.yaml"
     with pytest.raises(CalibrationMissing):
-        signers_of(calibration.parent / "none.yaml", {"anna": public.line})
+        signers_of(none_path, {"anna": public.line})
     signature_path(calibration, "anna").write_text("my notes")
     with pytest.raises(UsageError, match="no signature"):
         sign(calibration, secret, "anna")
@@ -341,12 +360,14 @@ def test_the_verbs_make_a_key_sign_and_check(
     out = capsys.readouterr().out
     assert "J4" in out
     assert "calibration.yaml.anna.minisig" in "".join(out.split())
-    assert signers_of(calibration, {"anna": made["public_key"]}) == ("anna",)
+    trusted = {"anna": made["public_key"]}
+    assert signers_of(calibration, trusted) == ("anna",)
     monkeypatch.setattr("sys.stdin", io.StringIO("secret\n"))
     assert main(["sign", "key", "--name", "bert", "--folder", folder]) == 0
     monkeypatch.setattr("sys.stdin", io.StringIO("other\n"))
     assert main([*signed[:4], f"{folder}/bert.key", "--name", "bert"]) == 2
-    calibration.write_bytes(calibration.read_bytes().replace(b"ml", b"ls", 1))
+    changed_content = calibration.read_bytes().replace(b"ml", b"ls", 1)
+    calibration.write_bytes(changed_content)
     assert main(signed) == 3  # a calibration that was edited is not signed
 
 
@@ -355,7 +376,8 @@ def test_check_names_the_signers_of_the_cell(
 ) -> None:
     secret, public = generate(calibration.parent, "anna")
     cell = calibration.parent / "cells" / "demo.yaml"
-    shutil.copytree(Path(__file__).parents[3] / "configs", calibration.parent, dirs_exist_ok=True)
+    configs_folder = Path(__file__).parents[3] / "configs"
+    shutil.copytree(configs_folder, calibration.parent, dirs_exist_ok=True)
     text = cell.read_text()
     assert "\npolicy:" not in text
     cell.write_text(
@@ -363,7 +385,8 @@ def test_check_names_the_signers_of_the_cell(
     )
     check = ["sign", "check", str(calibration), "--cell", str(cell)]
     assert main([*check, "--json"]) == 0
-    assert json.loads(capsys.readouterr().out) == {"signers": [], "signatures_needed": 1}
+    document = json.loads(capsys.readouterr().out)
+    assert document == {"signers": [], "signatures_needed": 1}
     sign(calibration, secret, "anna", at=NOW)
     assert main(check) == 0
     assert "Signed by: anna." in capsys.readouterr().out
@@ -376,14 +399,17 @@ def test_the_real_minisign_verifies_ours(calibration: Path) -> None:
     secret, public = generate(calibration.parent, "anna")
     path = sign(calibration, secret, "anna", at=NOW)
     verify = ["minisign", "-V", "-H", "-m", str(calibration), "-x", str(path), "-P", public.line]
-    assert subprocess.run(verify, capture_output=True, check=False).returncode == 0
+    completed = subprocess.run(verify, capture_output=True, check=False)
+    assert completed.returncode == 0
     calibration.write_bytes(b"changed")
     assert subprocess.run(verify, capture_output=True, check=False).returncode == 1
 
 
 def test_line_ends_of_another_system_do_not_change_a_signature() -> None:
-    windows = minisign.parse_signature(SIGNATURE.replace("\n", "\r\n"))
+    text = SIGNATURE.replace("\n", "\r\n")
+    windows = minisign.parse_signature(text)
     assert windows == minisign.parse_signature(SIGNATURE)
     minisign.check_signature(parse_public_key(PUBLIC), windows, CONTENT)
+    changed_signature = SIGNATURE.replace("\n", "\r")
     with pytest.raises(ValueError, match="four lines"):
-        minisign.parse_signature(SIGNATURE.replace("\n", "\r"))
+        minisign.parse_signature(changed_signature)

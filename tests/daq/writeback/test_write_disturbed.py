@@ -28,8 +28,10 @@ DENIALS = ("nothing was", "it is as it was", "as before")
 def cell(tmp_path: Path) -> Path:
     """The demo cell in a folder of its own."""
     kept = shutil.ignore_patterns("*.jsonl*", "*.sqlite*")
-    shutil.copytree(Path(__file__).parents[3] / "configs", tmp_path / "configs", ignore=kept)
-    return tmp_path / "configs" / "cells" / "demo.yaml"
+    configs_folder = Path(__file__).parents[3] / "configs"
+    shutil.copytree(configs_folder, tmp_path / "configs", ignore=kept)
+    cells_folder = tmp_path / "configs" / "cells"
+    return cells_folder / "demo.yaml"
 
 
 class Disk:
@@ -109,7 +111,8 @@ def test_no_message_denies_a_write_and_the_next_command_enters_it(
     assert after != before
     for at in range(whole.renamed - 4, len(whole.calls)):
         code, _ = run(at)
-        said, found = " ".join(capsys.readouterr().err.split()), controller.read_bytes()
+        error_output = capsys.readouterr().err
+        said, found = " ".join(error_output.split()), controller.read_bytes()
         assert found in (before, after), at
         if found == after:
             assert not any(denial in said for denial in DENIALS), (at, said)
@@ -135,7 +138,8 @@ def test_an_audit_that_takes_no_entry_is_named_and_nothing_is_written(
     before = controller.read_bytes()
 
     def full(descriptor: int, data: bytes) -> int:
-        if Path(f"/proc/self/fd/{descriptor}").readlink().name.endswith("audit.jsonl"):
+        path = Path(f"/proc/self/fd/{descriptor}")
+        if path.readlink().name.endswith("audit.jsonl"):
             raise OSError(code, os.strerror(code))
         return genuine(descriptor, data)
 
@@ -169,11 +173,13 @@ def test_what_is_in_place_is_called_applied_by_the_audit(
         patch.setattr(os, "replace", once)
         patch.setattr("daq.files.fsync_folder", unflushed)
         assert apply(cell, calibration) == ExitCode.UNEXPECTED
-    said = " ".join(capsys.readouterr().err.split())
+    error_output = capsys.readouterr().err
+    said = " ".join(error_output.split())
     assert "has the new content, complete; the history lacks this write" in said
     history = load_cell(cell).history
     assert history is not None
-    assert [entry.action for entry in read(history.audit)] == [
+    actions = [entry.action for entry in read(history.audit)]
+    assert actions == [
         AuditAction.APPLY_BEGUN,
         AuditAction.APPLIED,
     ]
@@ -204,7 +210,9 @@ def test_a_write_that_is_undone_after_a_flush_is_called_undone(
     monkeypatch.setattr("daq.files.fsync_folder", flush)
     assert main(["apply", str(cell), str(calibration), "--yes"]) == ExitCode.UNEXPECTED
     assert controller.read_bytes() == before
-    assert list(controller.parent.glob("*.bak")) == []
-    said = " ".join(capsys.readouterr().err.split())
+    files = controller.parent.glob("*.bak")
+    assert list(files) == []
+    error_output = capsys.readouterr().err
+    said = " ".join(error_output.split())
     assert "it is as it was" in said
     assert "it may have the new content" not in said

@@ -78,7 +78,8 @@ def _sampled(folder: Path) -> list[FaultRow]:
         unit = last[label]
         error = errno.errorcode[ERRORS[number % len(ERRORS)]]
         rows.append(scene.run(unit, Injection(KILL)))
-        rows.append(scene.run(unit, Injection(error, is_lasting=True)))
+        injection = Injection(error, is_lasting=True)
+        rows.append(scene.run(unit, injection))
     return rows
 
 
@@ -91,11 +92,12 @@ def test_sampled_failures_of_a_write_every_sentence_is_true_and_the_next_command
 ) -> None:
     _require_tracing(small)
     rows = small.submit(_sampled, tmp_path.resolve()).result()
-    assert [(row.call, row.file, row.false_sentences, row.bad_states) for row in rows] == [
-        (row.call, row.file, (), ()) for row in rows
-    ]
-    assert {row.content for row in rows} == {"old", "new"}
-    assert [row.code for row in rows].count(-1) == len(SAMPLE)
+    expected = [(row.call, row.file, (), ()) for row in rows]
+    assert [(row.call, row.file, row.false_sentences, row.bad_states) for row in rows] == expected
+    contents = {row.content for row in rows}
+    assert contents == {"old", "new"}
+    codes = [row.code for row in rows]
+    assert codes.count(-1) == len(SAMPLE)
     assert sum(count.cases for count in counts(rows)) == len(rows)
 
 
@@ -152,12 +154,14 @@ def test_drives_have_old_or_new_gains_and_a_record_of_both_after_any_fault(
     _require_tracing(small)
     rows = small.submit(_faults_of_drives, tmp_path.resolve()).result()
     assert len(rows) >= 8
-    assert [(row.number, row.error, row.false_sentences, row.bad_states) for row in rows] == [
-        (row.number, row.error, (), ()) for row in rows
-    ]
+    expected = [(row.number, row.error, (), ()) for row in rows]
+    assert [
+        (row.number, row.error, row.false_sentences, row.bad_states) for row in rows
+    ] == expected
     killed = {row.content for row in rows if row.code == -1}
     assert killed >= {"old", "both"}
-    assert {row.content for row in rows if row.code > 0} == {"old"}
+    contents = {row.content for row in rows if row.code > 0}
+    assert contents == {"old"}
 
 
 def _append_twice(path: Path) -> int:
@@ -187,10 +191,12 @@ def test_a_fault_is_at_the_chosen_call_and_the_call_is_not_made(
     path = tmp_path.resolve() / "file"
     whole = small.submit(_traced_twice, path, None).result()
     assert whole.code == 0
-    assert [call.name for call in whole.calls] == ["open", "write", "close"] * 2
+    expected = ["open", "write", "close"] * 2
+    assert [call.name for call in whole.calls] == expected
     assert path.read_text() == "line\n" * 2
     path.unlink()
-    failed = small.submit(_traced_twice, path, Fault(4, errno.EDQUOT)).result()
+    fault = Fault(4, errno.EDQUOT)
+    failed = small.submit(_traced_twice, path, fault).result()
     assert failed.code == 2
     assert path.read_text() == "line\n"
     path.unlink()
@@ -212,7 +218,8 @@ def _traced_at_once(path: Path, fault: Fault) -> Traced:
 def test_a_short_write_takes_the_bytes_that_it_says(tmp_path: Path, small: Executor) -> None:
     _require_tracing(small)
     path = tmp_path.resolve() / "file"
-    found = small.submit(_traced_at_once, path, Fault(1, length=3)).result()
+    fault = Fault(1, length=3)
+    found = small.submit(_traced_at_once, path, fault).result()
     assert found.code == 3
     assert path.read_text() == "123"
     assert found.calls[1].size == 8
@@ -242,7 +249,8 @@ LOGGED = (Call("open", STATE), Call("write", STATE), Call("fsync", STATE))
 def test_a_change_is_made_by_its_rename_or_its_write(
     calls: tuple[Call, ...], failing: int, is_not_made: bool
 ) -> None:
-    found = changes_not_made(calls[: failing + 1], Fault(failing, errno.EIO))
+    fault = Fault(failing, errno.EIO)
+    found = changes_not_made(calls[: failing + 1], fault)
     assert found == (frozenset({STATE}) if is_not_made else frozenset())
     again = changes_not_made((*calls[: failing + 1], *REPLACED), Fault(failing, errno.EIO))
     assert again == found
@@ -254,7 +262,8 @@ def test_a_change_is_made_by_its_rename_or_its_write(
 def _facts(content: Content, **changed: object) -> Facts:
     before = {CONTROLLER: b"old"}
     after = {CONTROLLER: content.value.encode()}
-    return replace(Facts(content, CONTROLLER, before, after, (), has_write=False), **changed)  # type: ignore[arg-type]
+    facts = Facts(content, CONTROLLER, before, after, (), has_write=False)
+    return replace(facts, **changed)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -281,15 +290,18 @@ def test_a_backup_that_is_named_must_have_the_old_content() -> None:
     backup = CONTROLLER.with_name("x.yaml.bak")
     right = _facts(Content.NEW, after={CONTROLLER: b"new", backup: b"old"})
     assert false_sentences(said, right) == ()
-    assert false_sentences(said, replace(right, after={backup: b"o"})) != ()
+    facts = replace(right, after={backup: b"o"})
+    assert false_sentences(said, facts) != ()
 
 
 def test_a_claim_that_no_rule_judges_is_a_finding() -> None:
-    assert false_sentences("The moon was restored.", _facts(Content.OLD)) != ()
+    facts = _facts(Content.OLD)
+    assert false_sentences("The moon was restored.", facts) != ()
 
 
 def test_an_exit_code_that_denies_or_invents_a_write_is_wrong() -> None:
-    assert wrong_code(0, "", _facts(Content.OLD)) != ""
+    facts = _facts(Content.OLD)
+    assert wrong_code(0, "", facts) != ""
     assert wrong_code(1, "", _facts(Content.NEW)) != ""
     assert wrong_code(1, "x has the new content, complete", _facts(Content.NEW)) == ""
     assert wrong_code(None, "", _facts(Content.OLD)) == ""
@@ -305,5 +317,7 @@ def test_a_part_of_the_study_keeps_the_rows_of_the_other_verbs(tmp_path: Path) -
     table.write_text(to_csv(FaultRow, earlier))
     new = (_row("rollback", 2), _row("rollback", 3))
     found = with_other_verbs(table, new, ["rollback"])
-    assert found == (earlier[0], *new, earlier[2])
-    assert with_other_verbs(tmp_path / "none.csv", new, ["rollback"]) == new
+    expected = (earlier[0], *new, earlier[2])
+    assert found == expected
+    none_path = tmp_path / "none.csv"
+    assert with_other_verbs(none_path, new, ["rollback"]) == new

@@ -41,7 +41,8 @@ def controller(tmp_path: Path) -> Path:
     """In a folder of its own."""
     path = tmp_path / "controllers" / "demo.yaml"
     path.parent.mkdir()
-    shutil.copyfile(CONFIGS / "controllers" / "demo.yaml", path)
+    demo_path = CONFIGS / "controllers" / "demo.yaml"
+    shutil.copyfile(demo_path, path)
     return path
 
 
@@ -72,21 +73,24 @@ def test_what_is_no_regular_file_is_no_controller_and_no_calibration(
 ) -> None:
     path = tmp_path / "x.yaml"
     made(path)
+    request = Request(demo_calibration(), NOW)
     with pytest.raises(ControllerUnfit):
-        propose(FileTarget(path, KEYS), Request(demo_calibration(), NOW))
+        propose(FileTarget(path, KEYS), request)
     with pytest.raises(CalibrationMissing):
         calibration_file.load_calibration(path)
 
 
 def test_a_link_that_leads_nowhere_says_where(tmp_path: Path) -> None:
     link = tmp_path / "link.yaml"
-    link.symlink_to(tmp_path / "gone" / "demo.yaml")
+    demo_path = tmp_path / "gone" / "demo.yaml"
+    link.symlink_to(demo_path)
+    request = Request(demo_calibration(), NOW)
     with pytest.raises(
         ControllerUnfit,
         match=r"a symbolic link to .*gone/demo\.yaml, which is "
         r"not there",
     ):
-        propose(FileTarget(link, KEYS), Request(demo_calibration(), NOW))
+        propose(FileTarget(link, KEYS), request)
 
 
 def test_links_in_a_circle_are_called_so(tmp_path: Path) -> None:
@@ -94,8 +98,9 @@ def test_links_in_a_circle_are_called_so(tmp_path: Path) -> None:
     other = tmp_path / "other.yaml"
     one.symlink_to(other)
     other.symlink_to(one)
+    request = Request(demo_calibration(), NOW)
     with pytest.raises(ControllerUnfit, match="round in a circle"):
-        propose(FileTarget(one, KEYS), Request(demo_calibration(), NOW))
+        propose(FileTarget(one, KEYS), request)
     with pytest.raises(ControllerUnfit, match="round in a circle"):
         rollback(FileTarget(one), NOW)
     with pytest.raises(CalibrationMissing):
@@ -108,12 +113,16 @@ def test_a_link_into_a_folder_that_everybody_may_write_is_not_followed(
     link = tmp_path / "link.yaml"
     link.symlink_to(controller)
     controller.parent.chmod(0o777)
+    request = Request(demo_calibration(), NOW)
     with pytest.raises(ControllerUnfit, match="everybody may write"):
-        propose(FileTarget(link, KEYS), Request(demo_calibration(), NOW))
+        propose(FileTarget(link, KEYS), request)
     # An operator who names the file itself has chosen it.
-    assert propose(FileTarget(controller, KEYS), Request(demo_calibration(), NOW)).refusals == ()
+    target = FileTarget(controller, KEYS)
+    refusals = propose(target, Request(demo_calibration(), NOW)).refusals
+    assert refusals == ()
     controller.parent.chmod(0o755)
-    assert propose(FileTarget(link, KEYS), Request(demo_calibration(), NOW)).refusals == ()
+    file_target = FileTarget(link, KEYS)
+    assert propose(file_target, Request(demo_calibration(), NOW)).refusals == ()
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root may give a link away")
@@ -121,10 +130,13 @@ def test_the_link_of_another_user_is_not_followed(controller: Path, tmp_path: Pa
     link = tmp_path / "link.yaml"
     link.symlink_to(controller)
     os.lchown(link, 4711, 4711)
+    request = Request(demo_calibration(), NOW)
     with pytest.raises(ControllerUnfit, match="user 4711 has made"):
-        propose(FileTarget(link, KEYS), Request(demo_calibration(), NOW))
+        propose(FileTarget(link, KEYS), request)
     os.chown(controller, 4711, 4711)
-    written = apply(propose(FileTarget(link, KEYS), Request(demo_calibration(), NOW)), NOW)
+    target = FileTarget(link, KEYS)
+    proposal = propose(target, Request(demo_calibration(), NOW))
+    written = apply(proposal, NOW)
     assert written is not None
     assert written.backup is not None
     assert (controller.stat().st_uid, written.backup.stat().st_uid) == (4711, 4711)
@@ -137,24 +149,29 @@ def test_a_file_of_two_names_is_not_written_under_one_of_them(
     other = tmp_path / "plc's.yaml"
     other.hardlink_to(controller)
     for name in (controller, other):
+        request = Request(demo_calibration(), NOW)
         with pytest.raises(ControllerUnfit, match=r"2 names \(hard links\)") as caught:
-            propose(FileTarget(name, KEYS), Request(demo_calibration(), NOW))
+            propose(FileTarget(name, KEYS), request)
     remedy = str(caught.value).rpartition("of its own: ")[2]
-    assert subprocess.run(remedy, shell=True, check=False).returncode == 0
+    completed = subprocess.run(remedy, shell=True, check=False)
+    assert completed.returncode == 0
     assert controller.stat().st_nlink == 1
     assert other.read_bytes() == controller.read_bytes()
-    assert propose(FileTarget(other, KEYS), Request(demo_calibration(), NOW)).refusals == ()
-    assert (
-        apply(propose(FileTarget(controller, KEYS), Request(demo_calibration(), NOW)), NOW)
-        is not None
-    )
+    target = FileTarget(other, KEYS)
+    refusals = propose(target, Request(demo_calibration(), NOW)).refusals
+    assert refusals == ()
+    file_target = FileTarget(controller, KEYS)
+    proposal = propose(file_target, Request(demo_calibration(), NOW))
+    assert apply(proposal, NOW) is not None
 
 
 def test_a_link_between_the_look_and_the_write_changes_nothing(
     controller: Path, tmp_path: Path
 ) -> None:
     """The lock's name is no way to another file either."""
-    proposal = propose(FileTarget(controller, KEYS), Request(demo_calibration(), NOW))
+    request = Request(demo_calibration(), NOW)
+    target = FileTarget(controller, KEYS)
+    proposal = propose(target, request)
     victim = tmp_path / "victim"
     (controller.parent / ".demo.yaml.lock").symlink_to(victim)
     with pytest.raises(OutputFailed, match=r"\.demo\.yaml\.lock: found .*symbolic link"):
@@ -169,20 +186,23 @@ def test_a_deleted_file_comes_back_through_its_link_and_is_recorded(
     link = tmp_path / "link.yaml"
     link.symlink_to(controller)
     before = controller.read_bytes()
+    request = Request(demo_calibration(), NOW)
+    target = FileTarget(link, KEYS)
+    proposal = propose(target, request)
     apply(
-        propose(FileTarget(link, KEYS), Request(demo_calibration(), NOW)),
+        proposal,
         NOW,
         audit=audit,
         who="Ada",
     )
     controller.unlink()
-    assert rollback(FileTarget(link), NOW, audit=audit, who="Bob").edit.subject == str(controller)
+    edit = rollback(FileTarget(link), NOW, audit=audit, who="Bob").edit
+    assert edit.subject == str(controller)
     assert controller.read_bytes() == before
     entries = read(audit)
-    assert [entry.action for entry in entries][2:] == [
-        AuditAction.ROLLBACK_BEGUN,
-        AuditAction.ROLLED_BACK,
-    ]
+    expected = [AuditAction.ROLLBACK_BEGUN, AuditAction.ROLLED_BACK]
+    actions = [entry.action for entry in entries]
+    assert actions[2:] == expected
     assert entries[2].details["sha256_before"] is None
     assert {entry.subject for entry in entries} == {str(controller)}
 
@@ -192,7 +212,9 @@ def test_what_fails_within_a_write_is_recorded_as_failed(
 ) -> None:
     audit = tmp_path / "audit.jsonl"
     before = controller.read_bytes()
-    proposal = propose(FileTarget(controller, KEYS), Request(demo_calibration(), NOW))
+    request = Request(demo_calibration(), NOW)
+    target = FileTarget(controller, KEYS)
+    proposal = propose(target, request)
 
     def full(*_: object, **__: object) -> None:
         raise OSError(28, "No space left on device")
@@ -202,7 +224,8 @@ def test_what_fails_within_a_write_is_recorded_as_failed(
         apply(proposal, NOW, audit=audit, who="Ada")
     assert controller.read_bytes() == before
     begun, failed = read(audit)
-    assert (begun.action, failed.action) == (AuditAction.APPLY_BEGUN, AuditAction.FAILED)
+    expected = (AuditAction.APPLY_BEGUN, AuditAction.FAILED)
+    assert (begun.action, failed.action) == expected
     assert failed.details["begun"] == begun.number
     assert "No space" in str(failed.details["error"])
     assert failed.details["sha256_found"] == begun.details["sha256_before"]
@@ -222,7 +245,9 @@ def test_an_end_that_cannot_be_recorded_leaves_the_write_and_a_warning(
         return append(path, action, **rest)  # type: ignore[arg-type]
 
     monkeypatch.setattr("daq.writeback.target.record_write", full_at_the_end)
-    proposal = propose(FileTarget(controller, KEYS), Request(demo_calibration(), NOW))
+    request = Request(demo_calibration(), NOW)
+    target = FileTarget(controller, KEYS)
+    proposal = propose(target, request)
     assert apply(proposal, NOW, audit=audit, who="Ada") is not None
     assert "the audit log may lack the entry that it is applied" in caplog.text
     (left,) = verify(audit).open_writes
@@ -231,9 +256,12 @@ def test_an_end_that_cannot_be_recorded_leaves_the_write_and_a_warning(
 
 def _write_and_delete_log(controller: Path, audit: Path) -> None:
     """Apply a calibration, and remove the audit log of it with the note of its last entry."""
+    request = Request(demo_calibration(), NOW)
+    target = FileTarget(controller, KEYS)
+    proposal = propose(target, request)
     assert (
         apply(
-            propose(FileTarget(controller, KEYS), Request(demo_calibration(), NOW)),
+            proposal,
             NOW,
             audit=audit,
         )
@@ -259,14 +287,18 @@ def test_a_rollback_beside_a_deleted_log_works_and_the_new_log_says_what_is_miss
     caplog.clear()
     rollback(FileTarget(controller), NOW, audit=audit, who="Ada")  # the log is there again
     assert caplog.text == ""
-    assert BACKUPS_WITHOUT_LOG not in read(audit)[-2].details
+    details = read(audit)[-2].details
+    assert BACKUPS_WITHOUT_LOG not in details
 
 
 def test_a_first_write_misses_no_log(
     controller: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     audit = tmp_path / "audit.jsonl"
-    apply(propose(FileTarget(controller, KEYS), Request(demo_calibration(), NOW)), NOW, audit=audit)
+    request = Request(demo_calibration(), NOW)
+    target = FileTarget(controller, KEYS)
+    proposal = propose(target, request)
+    apply(proposal, NOW, audit=audit)
     assert caplog.text == ""
     assert all(BACKUPS_WITHOUT_LOG not in entry.details for entry in read(audit))
 
@@ -290,4 +322,5 @@ def test_history_is_not_called_sound_where_backups_show_that_its_log_is_gone(
     assert main(["rollback", str(cell_file), "--yes"]) == ExitCode.OK
     capsys.readouterr()
     assert main(["history", str(cell_file), "--verify"]) == ExitCode.OK
-    assert "an earlier log was removed or moved" in " ".join(capsys.readouterr().out.split())
+    printed = capsys.readouterr().out
+    assert "an earlier log was removed or moved" in " ".join(printed.split())

@@ -33,19 +33,20 @@ def written(bus: ScriptedBus) -> list[str]:
 def test_a_drive_of_this_data_sheet_is_set_up_moved_and_restored(
     file: str, profile: str, shared_data: Path
 ) -> None:
-    network, bus = foreign_cell(shared_data / "eds" / file, shipped(profile))
+    sheet = shared_data / "eds" / file
+    network, bus = foreign_cell(sheet, shipped(profile))
     before = [settings(node) for node in bus.nodes]
     with network:
         network.prepare()
-        stream = SyncStream(network, LockstepSync(PERIOD_NS, 0.005, clock=bus.clock))
+        pacing = LockstepSync(PERIOD_NS, 0.005, clock=bus.clock)
+        stream = SyncStream(network, pacing)
         samples = list(execute(network, stream, (MOVE,), permission()))
         assert not any(sample.missing for sample in samples)
         # A drive that acts in its 6040h callback would have gone to the target of before.
-        assert [(node.position, len(node.setpoint_cycles)) for node in bus.nodes] == [
-            (3000, 1),
-            (-2000, 1),
-        ]
-        assert samples[-1].position_counts == (3000, -2000)
+        expected = [(3000, 1), (-2000, 1)]
+        assert [(node.position, len(node.setpoint_cycles)) for node in bus.nodes] == expected
+        position_counts = samples[-1].position_counts
+        assert position_counts == (3000, -2000)
     assert [settings(node) for node in bus.nodes] == before
 
 
@@ -63,9 +64,8 @@ def settings(node: object) -> dict[str, int]:
 
 
 def test_a_fixed_mapping_that_carries_the_same_is_used_as_it_is(shared_data: Path) -> None:
-    network, bus = foreign_cell(
-        shared_data / "eds" / "pilz_prbt_0_1.dcf", shipped("schunk-pilz-prbt"), fixed=True
-    )
+    sheet = shared_data / "eds" / "pilz_prbt_0_1.dcf"
+    network, bus = foreign_cell(sheet, shipped("schunk-pilz-prbt"), fixed=True)
     for node in bus.nodes:
         for base, number, words in (
             (0x1A00, 0, (0x60410010, 0x60770010, 0x60640020)),  # the default in the data sheet
@@ -76,17 +76,20 @@ def test_a_fixed_mapping_that_carries_the_same_is_used_as_it_is(shared_data: Pat
                 node.store(base + number, sub, value)
     with network:
         network.prepare()
-        assert network.pdos[0].feedback[0].entries == (0x60410010, 0x60770010, 0x60640020)
-        stream = SyncStream(network, LockstepSync(PERIOD_NS, 0.005, clock=bus.clock))
+        entries = network.pdos[0].feedback[0].entries
+        assert entries == (0x60410010, 0x60770010, 0x60640020)
+        pacing = LockstepSync(PERIOD_NS, 0.005, clock=bus.clock)
+        stream = SyncStream(network, pacing)
         samples = list(execute(network, stream, (MOVE,), permission()))
-        assert samples[-1].position_counts == (3000, -2000)
-        assert {word & 0x6F for word in samples[-1].statusword} == {0x40}
+        expected = (3000, -2000)
+        assert samples[-1].position_counts == expected
+        statusword = samples[-1].statusword
+        assert {word & 0x6F for word in statusword} == {0x40}
 
 
 def test_a_fixed_mapping_that_does_not_carry_the_same_is_refused(shared_data: Path) -> None:
-    network, _ = foreign_cell(
-        shared_data / "eds" / "pilz_prbt_0_1.dcf", shipped("schunk-pilz-prbt"), fixed=True
-    )
+    sheet = shared_data / "eds" / "pilz_prbt_0_1.dcf"
+    network, _ = foreign_cell(sheet, shipped("schunk-pilz-prbt"), fixed=True)
     with pytest.raises(SetupRefused, match=r"J1 \(node 1\): TPDO1: writing .*read only"), network:
         network.prepare()
 
@@ -120,9 +123,8 @@ def test_a_profile_that_does_not_fit_is_refused_before_anything_is_written(
     file: str, missing: str, fitting: str, shared_data: Path
 ) -> None:
     others = tuple(map(shipped, ("elmo-gold", "maxon-epos4", "schunk-pilz-prbt", "copley")))
-    network, bus = foreign_cell(
-        shared_data / "eds" / file, shipped("generic-cia402"), profiles=lambda: others
-    )
+    sheet = shared_data / "eds" / file
+    network, bus = foreign_cell(sheet, shipped("generic-cia402"), profiles=lambda: others)
     with pytest.raises(SetupRefused) as refused, network:
         network.prepare()
     assert missing in str(refused.value)
@@ -131,9 +133,8 @@ def test_a_profile_that_does_not_fit_is_refused_before_anything_is_written(
 
 
 def test_too_few_pdos_are_named_before_anything_is_written(shared_data: Path) -> None:
-    network, bus = foreign_cell(
-        shared_data / "eds" / "pilz_prbt_0_1.dcf", shipped("schunk-pilz-prbt")
-    )
+    sheet = shared_data / "eds" / "pilz_prbt_0_1.dcf"
+    network, bus = foreign_cell(sheet, shipped("schunk-pilz-prbt"))
     for node in bus.nodes:
         assert isinstance(node, ForeignNode)
         del node.local.object_dictionary[0x1401]
@@ -143,7 +144,8 @@ def test_too_few_pdos_are_named_before_anything_is_written(shared_data: Path) ->
 
 
 def rpdo(number: int, *entries: int) -> PdoRecord:
-    return PdoRecord(Direction.RPDO, number, 0x201 + 0x100 * number, 255, entries)
+    cob_id = 0x201 + 0x100 * number
+    return PdoRecord(Direction.RPDO, number, cob_id, 255, entries)
 
 
 PROFILE_RPDOS = (rpdo(2, 0x60810020, 0x60830020), rpdo(3, 0x60840020))
@@ -172,9 +174,8 @@ def test_own_rpdos_are_used_only_if_the_target_comes_first_and_nothing_else(
     command: tuple[PdoRecord, ...], fits: bool
 ) -> None:
     used = fixed_setpoints(command + PROFILE_RPDOS)
-    assert [record.number for record in used] == (
-        [r.number for r in command + PROFILE_RPDOS] if fits else []
-    )
+    numbers = [record.number for record in used]
+    assert numbers == ([r.number for r in command + PROFILE_RPDOS] if fits else [])
     assert all(record.transmission == 1 for record in used)
 
 
@@ -203,9 +204,8 @@ def test_each_data_sheet_is_set_up_by_each_profile_or_refused_in_words_and_left_
     file: str, profile: str, shared_data: Path
 ) -> None:
     others = tuple(map(shipped, PROFILES))
-    network, bus = foreign_cell(
-        shared_data / "eds" / file, shipped(profile), profiles=lambda: others
-    )
+    sheet = shared_data / "eds" / file
+    network, bus = foreign_cell(sheet, shipped(profile), profiles=lambda: others)
     before = [settings(node) for node in bus.nodes]
     refused = None
     with contextlib.suppress(SetupRefused), network:

@@ -53,14 +53,17 @@ def test_layout_decodes_what_a_drive_would_send(
 
 
 def test_what_cannot_be_packed_is_refused() -> None:
+    object_entry = ObjectEntry(0x2000, 0, 24, signed=True)
     with pytest.raises(ValueError, match="24 bits"):
-        pack([ObjectEntry(0x2000, 0, 24, signed=True)])
+        pack([object_entry])
+    object_entries = [ObjectEntry(0x2000 + n, 0, 32, signed=True) for n in range(9)]
     with pytest.raises(ValueError, match="5 PDOs"):
-        pack([ObjectEntry(0x2000 + n, 0, 32, signed=True) for n in range(9)])
+        pack(object_entries)
 
 
 def test_setpoints_have_the_predefined_cob_ids() -> None:
-    assert [record.cob_id for record in records(Direction.RPDO, 5, SETPOINT_PDOS)] == [
+    cob_ids = [record.cob_id for record in records(Direction.RPDO, 5, SETPOINT_PDOS)]
+    assert cob_ids == [
         0x205,
         0x305,
         0x405,

@@ -46,12 +46,14 @@ def test_scan_reports_who_is_there_and_changes_nothing() -> None:
     before = [copy.deepcopy(node.objects) for node in bus.nodes]
     with network:
         first, second = network.scan(wait_s=0.05)
-    assert first.identity == Identity(0x29A, 0x40200, 7)
+    expected = Identity(0x29A, 0x40200, 7)
+    assert first.identity == expected
     assert (first.node_id, first.device_name, first.state) == (1, "axis", State.SWITCH_ON_DISABLED)
     assert (second.node_id, second.identity, second.nmt) == (2, None, NmtState.STOPPED)
     for node, objects in zip(bus.nodes, before, strict=True):
         assert {**node.objects, (0x6041, 0): None} == {**objects, (0x6041, 0): None}
-    assert not [frame for frame in bus.sent if frame.arbitration_id < 0x580]
+    frames = [frame for frame in bus.sent if frame.arbitration_id < 0x580]
+    assert not frames
 
 
 def test_a_node_without_name_and_serial_is_described_as_far_as_it_reports() -> None:
@@ -60,7 +62,8 @@ def test_a_node_without_name_and_serial_is_described_as_far_as_it_reports() -> N
         del bus.nodes[0].objects[key]
     with network:
         (found,) = network.scan(wait_s=0.05)
-    assert found.identity == Identity(0x29A, 0x40200, None)
+    expected = Identity(0x29A, 0x40200, None)
+    assert found.identity == expected
     assert (found.device_name, found.state) == (None, None)
 
 
@@ -68,11 +71,13 @@ def test_a_node_with_a_vendor_alone_has_an_identity() -> None:
     network, bus = cell(1)
     for subindex in (2, 3, 4):
         del bus.nodes[0].objects[0x1018, subindex]
-    network.axes = (replace(network.axes[0], identity=Identity(0x29A)),)
+    changed_axis = replace(network.axes[0], identity=Identity(0x29A))
+    network.axes = (changed_axis,)
     with network:
         (found,) = network.scan(wait_s=0.05)
         assert network.check_identities() == (Identity(0x29A),)
-    assert (found.identity, found.problems) == (Identity(0x29A), ())
+    expected = (Identity(0x29A), ())
+    assert (found.identity, found.problems) == expected
 
 
 def test_prepare_sets_up_and_leaving_restores_everything() -> None:
@@ -125,8 +130,10 @@ def test_an_axis_that_someone_enabled_is_without_power_afterwards() -> None:
         network.prepare()
         for command in (6, 7, 15):
             bus.nodes[0].control(command, 0)
-        assert network.statuswords()[0] & 0x6F == 0x27
-    assert bus.nodes[0].statusword & 0x6F == 0x40
+        first_statusword = network.statuswords()[0]
+        assert first_statusword & 0x6F == 0x27
+    statusword = bus.nodes[0].statusword
+    assert statusword & 0x6F == 0x40
 
 
 def test_an_axis_that_stays_in_quick_stop_is_without_power_afterwards() -> None:
@@ -136,12 +143,14 @@ def test_an_axis_that_stays_in_quick_stop_is_without_power_afterwards() -> None:
         network.prepare()
         for command in (6, 7, 15):
             bus.nodes[0].control(command, 0)
-    assert bus.nodes[0].statusword & 0x6F == 0x40
+    statusword = bus.nodes[0].statusword
+    assert statusword & 0x6F == 0x40
 
 
 def test_a_missing_node_is_named_with_those_that_answered() -> None:
     clock = FakeClock()
-    bus = ScriptedBus((ScriptedNode(1),), clock)
+    nodes = (ScriptedNode(1),)
+    bus = ScriptedBus(nodes, clock)
     axes = (Axis("J1", 1, PROFILE), Axis("J2", 2, PROFILE))
     network = CanopenNetwork(ADDRESS, axes, clock=clock, opener=lambda address: bus)
     with (
@@ -224,9 +233,10 @@ def test_a_drive_with_node_guarding_alone_is_refused_before_anything_is_written(
         ),
     ):
         network.prepare()
-    assert [
+    frames = [
         frame for frame in bus.sent if frame.arbitration_id == 0x602 and frame.data[0] >> 5 == 1
-    ] == []
+    ]
+    assert frames == []
 
 
 REFUSED = 0x08000022  # "because of the present device state"
@@ -264,7 +274,9 @@ def test_a_setting_that_a_drive_refuses_is_named_and_the_others_are_restored(
         (0x1400, 1),
         (0x1600, 0),
     ]
-    before = [[node.value(*key) for key in settings] for node in bus.nodes]
+    before = []
+    for node in bus.nodes:
+        before.append([node.value(*key) for key in settings])
     with pytest.raises(SetupRefused) as refused, network:
         network.prepare()
     said = str(refused.value)
@@ -295,7 +307,8 @@ def test_a_drive_that_waits_for_sync_with_a_counter_gets_it_without_and_its_own_
     with network:
         network.prepare()
         assert bus.nodes[1].value(0x1019, 0) == 0
-        assert bus.nodes[1].on_sync(0)[0].arbitration_id == 0x182
+        arbitration_id = bus.nodes[1].on_sync(0)[0].arbitration_id
+        assert arbitration_id == 0x182
     assert bus.nodes[1].value(0x1019, 0) == 10
 
 
@@ -340,12 +353,14 @@ class BootingNode(ScriptedNode):
 
 def slowly_booting(boots_s: float) -> tuple[CanopenNetwork, ScriptedBus]:
     network, bus = cell(2)
-    bus.nodes = (bus.nodes[0], BootingNode(2, bus.clock, boots_s))
+    booting_node = BootingNode(2, bus.clock, boots_s)
+    bus.nodes = (bus.nodes[0], booting_node)
     return network, bus
 
 
 def test_a_drive_that_boots_while_it_is_searched_is_asked_again() -> None:
-    network, bus = slowly_booting(network_listens_s() + 0.05)
+    boots_s = network_listens_s() + 0.05
+    network, bus = slowly_booting(boots_s)
     with network:
         network.prepare()
         assert bus.nodes[1].nmt == 5
@@ -405,10 +420,10 @@ def test_a_pdo_whose_cob_id_is_fixed_gets_the_rest() -> None:
     with network:
         # TPDO2 carries the statusword by default: it cannot be switched off, but it can be used
         network.prepare()
-        assert [record.entries for record in network.pdos[0].feedback] == [
-            (0x60640020, 0x60740010),
-            (0x60410010,),
-        ]
+        feedback = network.pdos[0].feedback
+        entries = [record.entries for record in feedback]
+        expected = [(0x60640020, 0x60740010), (0x60410010,)]
+        assert entries == expected
         assert bus.nodes[0].value(0x1801, 2) == 1
     for key in (
         (0x1800, 1),
@@ -419,7 +434,8 @@ def test_a_pdo_whose_cob_id_is_fixed_gets_the_rest() -> None:
         (0x1A00, 1),
         (0x1A01, 0),
     ):
-        assert bus.nodes[0].objects[key] == before[key]
+        objects = bus.nodes[0].objects
+        assert objects[key] == before[key]
 
 
 def test_a_multiplexed_pdo_is_switched_off_and_on_again() -> None:
@@ -436,8 +452,12 @@ def test_a_drive_with_small_pdos_gets_more_of_them() -> None:
     bus.nodes[0].largest_pdo_bits = 48
     with network:
         network.prepare()
-        assert [len(record.entries) for record in network.pdos[0].feedback] == [2, 1]
-        assert [len(record.entries) for record in network.pdos[0].setpoints] == [2, 1, 1, 1]
+        feedback = network.pdos[0].feedback
+        entry_counts = [len(record.entries) for record in feedback]
+        assert entry_counts == [2, 1]
+        expected = [2, 1, 1, 1]
+        setpoints = network.pdos[0].setpoints
+        assert [len(record.entries) for record in setpoints] == expected
 
 
 def test_a_mode_that_is_not_taken_is_refused() -> None:
@@ -452,7 +472,8 @@ def test_a_lost_answer_is_asked_for_again_and_a_late_one_not_believed() -> None:
     lose_first_answer(bus, repeats=True)
     with network:
         access = network.link.objects(1)
-        assert access.read(ObjectEntry(0x1018, 1, 32, signed=False)) == 0x29A
+        object_entry = ObjectEntry(0x1018, 1, 32, signed=False)
+        assert access.read(object_entry) == 0x29A
         assert access.read(ObjectEntry(0x6075, 0, 32, signed=False)) == 2000
 
 
@@ -460,10 +481,11 @@ def test_sdo_failures_name_node_object_and_reason() -> None:
     network, bus = cell(1)
     with network:
         access = network.link.objects(1)
+        object_entry = ObjectEntry(0x2000, 0, 32, signed=False)
         with pytest.raises(
             ObjectAccessError, match=r"J1 \(node 1\): object 2000h:00: aborted.*does not exist"
         ) as aborted:
-            access.read(ObjectEntry(0x2000, 0, 32, signed=False))
+            access.read(object_entry)
         assert aborted.value.abort_code == 0x06020000
         with pytest.raises(ObjectAccessError, match="has 16 bits, expected 32"):
             access.read(ObjectEntry(0x6074, 0, 32, signed=True))
@@ -487,7 +509,8 @@ def test_faults_are_reset_only_on_request_and_never_into_power() -> None:
     bus.nodes[1].fault()
     with network:
         network.prepare()
-        assert bus.nodes[1].statusword & 0x4F == 0x08
+        statusword = bus.nodes[1].statusword
+        assert statusword & 0x4F == 0x08
         network.reset_faults()
         assert bus.nodes[1].statusword & 0x6F == 0x40
     assert all(node.powered_cycles == 0 for node in bus.nodes)
@@ -496,11 +519,10 @@ def test_faults_are_reset_only_on_request_and_never_into_power() -> None:
 def test_bus_off_is_an_error_and_other_error_frames_are_not() -> None:
     network, bus = cell(1)
     with network:
-        bus.inject(
-            can.Message(
-                arbitration_id=0x04, is_extended_id=True, is_error_frame=True, data=bytes(8)
-            )
+        message = can.Message(
+            arbitration_id=0x04, is_extended_id=True, is_error_frame=True, data=bytes(8)
         )
+        bus.inject(message)
         network.link.pump(0.0)
         bus.inject(
             can.Message(
@@ -518,7 +540,8 @@ def test_emcy_and_its_end_are_reported_in_words() -> None:
         bus.inject(bus.nodes[0].emcy(0x0000))
         network.link.pump(0.0)
         first, second = network.link.take_events(5, (1,))
-    assert (first.kind, first.code, first.axis, first.time_ns) == (EventKind.EMCY, 0x2310, 0, 5)
+    expected = (EventKind.EMCY, 0x2310, 0, 5)
+    assert (first.kind, first.code, first.axis, first.time_ns) == expected
     assert "EMCY 2310h continuous over-current" in first.text
     assert second.kind is EventKind.EMCY_RESET
 
@@ -581,7 +604,8 @@ def test_one_bus_that_fails_while_the_network_closes_does_not_leave_the_other_ax
             node.statusword = 0x0227
         bus.send = fail  # type: ignore[method-assign]
     given_up = times > 1
-    assert [node.statusword & 0x6F for node in bus.nodes] == [0x27 if given_up else 0x40] * 2
+    expected = [0x27 if given_up else 0x40] * 2
+    assert [node.statusword & 0x6F for node in bus.nodes] == expected
     assert [node.value(0x6060, 0) for node in bus.nodes] == [1 if given_up else 8] * 2
     assert reported == (2 if given_up else 1)
 
@@ -665,7 +689,8 @@ def test_asked_a_second_time_nothing_more_is_restored_and_every_axis_is_named() 
         for _, data in writes
         if data[0] >> 5 == 1 and (index := data[2] << 8 | data[1]) != 0x6040
     ] == []
-    assert re.findall(r"(J\d): TPDO1", str(left.value)) == ["J1", "J2", "J3"]
+    matches = re.findall(r"(J\d): TPDO1", str(left.value))
+    assert matches == ["J1", "J2", "J3"]
 
 
 def test_an_axis_that_had_power_and_fell_silent_is_named_alone() -> None:
@@ -675,9 +700,8 @@ def test_an_axis_that_had_power_and_fell_silent_is_named_alone() -> None:
         network.powered.update(network.node_ids)
         bus.tamper = lambda m: () if m.arbitration_id == 0x582 else (m,)
         raise ValueError("cause")
-    assert [note for note in error.value.__notes__ if note.startswith(POWERED)] == [
-        f"{POWERED}J2 (node 2)"
-    ]
+    notes = [note for note in error.value.__notes__ if note.startswith(POWERED)]
+    assert notes == [f"{POWERED}J2 (node 2)"]
 
 
 @pytest.mark.parametrize("cause", [True, False], ids=["beside another error", "alone"])

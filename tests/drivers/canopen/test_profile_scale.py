@@ -46,11 +46,8 @@ def test_a_drive_reports_its_ampere_and_its_motor() -> None:
         node.objects[0x6076, 0] = (1500, 4)
         found = read_scale(access, RATED)
     assert found.ampere_per_unit == pytest.approx(0.002)
-    assert (found.objects, found.rated_current_a, found.rated_torque_nm) == (
-        {"6075h:00": 2000},
-        2.0,
-        1.5,
-    )
+    expected = ({"6075h:00": 2000}, 2.0, 1.5)
+    assert (found.objects, found.rated_current_a, found.rated_torque_nm) == expected
     assert found.warnings == ()
 
 
@@ -67,12 +64,14 @@ def test_a_drive_without_rated_torque_says_that_nothing_was_checked(torque: int 
 @pytest.mark.parametrize("lacking", [0x6075, 0x6076])
 def test_a_torque_without_a_unit_is_said_not_to_be_logged(lacking: int) -> None:
     fixed = replace(PROFILE.current_scale, factor=0.002, objects=())  # it needs no rated current
-    profile = replace(RATED, current_scale=fixed, torque=ObjectEntry(0x6077, 0, 16, signed=True))
+    torque = ObjectEntry(0x6077, 0, 16, signed=True)
+    profile = replace(RATED, current_scale=fixed, torque=torque)
     with drive() as (access, node):
         node.objects[0x6076, 0] = (1500, 4)
         node.objects[lacking, 0] = (0, 4)
         (warning,) = read_scale(access, profile).warnings
-        (without,) = read_scale(access, replace(profile, torque=None)).warnings
+        changed_profile = replace(profile, torque=None)
+        (without,) = read_scale(access, changed_profile).warnings
     assert warning == f"{without}, and its torque (6077h:00) is not logged"
 
 
@@ -108,7 +107,8 @@ def test_a_rated_current_in_another_unit_is_named(milliampere: int, message: str
 @pytest.mark.parametrize("ampere_per_unit", [1.0, 2.0e-5])
 def test_a_step_that_does_not_fit_the_motor_is_named(ampere_per_unit: float) -> None:
     """2 A are two steps of 1 A, and more steps of 20 µA than 16 bits can say."""
-    wrong = replace(RATED, current_scale=CurrentScale(ampere_per_unit, (), ScaleForm.FIXED_STEP))
+    current_scale = CurrentScale(ampere_per_unit, (), ScaleForm.FIXED_STEP)
+    wrong = replace(RATED, current_scale=current_scale)
     with (
         drive() as (access, _),
         pytest.raises(SetupRefused, match=r"2 A in steps of .*32767 steps, .* range of 6074h"),
@@ -119,23 +119,25 @@ def test_a_step_that_does_not_fit_the_motor_is_named(ampere_per_unit: float) -> 
 @pytest.mark.parametrize(("choice", "share"), [(0, math.sqrt(0.5)), (1, 1.0)])
 def test_a_switch_chooses_the_weight(choice: int, share: float) -> None:
     switch = ObjectEntry(0x2002, 0x54, 32, signed=False)
-    scale = CurrentScale(
-        1e-6, (RATED_CURRENT,), ScaleForm.SWITCHED_PER_MILLE, switch, (math.sqrt(0.5), 1.0)
-    )
+    weights = (math.sqrt(0.5), 1.0)
+    scale = CurrentScale(1e-6, (RATED_CURRENT,), ScaleForm.SWITCHED_PER_MILLE, switch, weights)
     with drive() as (access, node):
         node.objects[0x2002, 0x54] = (choice, 4)
-        found = read_scale(access, replace(RATED, current_scale=scale))
+        profile = replace(RATED, current_scale=scale)
+        found = read_scale(access, profile)
         assert found.ampere_per_unit == pytest.approx(0.002 * share)
-        assert found.objects == {"6075h:00": 2000, "2002h:54": choice}
+        expected = {"6075h:00": 2000, "2002h:54": choice}
+        assert found.objects == expected
         node.objects[0x2002, 0x54] = (2, 4)
+        changed_rated = replace(RATED, current_scale=scale)
         with pytest.raises(SetupRefused, match=r"2002h:54 = 2; expected 0 to 1"):
-            read_scale(access, replace(RATED, current_scale=scale))
+            read_scale(access, changed_rated)
 
 
 def test_a_missing_scale_object_is_an_error_and_not_a_warning() -> None:
-    missing = replace(
-        PROFILE, current_scale=CurrentScale(1e-6, (ObjectEntry(0x203B, 1, 32, signed=False),))
-    )
+    objects = (ObjectEntry(0x203B, 1, 32, signed=False),)
+    current_scale = CurrentScale(1e-6, objects)
+    missing = replace(PROFILE, current_scale=current_scale)
     with drive() as (access, _), pytest.raises(ObjectAccessError, match="203Bh:01"):
         read_scale(access, missing)
 
@@ -183,7 +185,8 @@ def test_what_a_drive_does_not_report_is_not_compared() -> None:
 def test_a_scale_is_proportional_to_each_of_its_objects(
     factor: float, values: tuple[int, ...], choice: int
 ) -> None:
-    scale = CurrentScale(factor, (), weights=(0.5, 1.0, 2.0))
+    weights = (0.5, 1.0, 2.0)
+    scale = CurrentScale(factor, (), weights=weights)
     whole = scale.ampere_per_unit(values, choice)
     assert whole > 0.0
     assert scale.ampere_per_unit((*values, 7), choice) == pytest.approx(7.0 * whole)
@@ -196,7 +199,7 @@ def test_a_scale_is_proportional_to_each_of_its_objects(
 
 def test_an_actual_current_is_shouted() -> None:
     assert PROFILE.signal == "current reference 6074h:00"
-    assert replace(PROFILE, tap=TapPoint.LIMITED_REFERENCE).signal == (
-        "limited current reference 6074h:00"
-    )
-    assert replace(PROFILE, tap=TapPoint.ACTUAL).signal == "ACTUAL current 6074h:00"
+    changed_profile = replace(PROFILE, tap=TapPoint.LIMITED_REFERENCE)
+    assert changed_profile.signal == ("limited current reference 6074h:00")
+    signal = replace(PROFILE, tap=TapPoint.ACTUAL).signal
+    assert signal == "ACTUAL current 6074h:00"

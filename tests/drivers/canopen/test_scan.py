@@ -26,16 +26,19 @@ from tests.drivers.scripted import PERIOD_NS, ScriptedBus, ScriptedNode, cell, l
 @pytest.mark.parametrize(("answer", "problem"), HOSTILE)
 def test_every_node_is_reported_whatever_one_of_them_does(answer: Answer, problem: str) -> None:
     network, bus = cell(3)
-    bus.nodes = (bus.nodes[0], Hostile(2, bus, answer), bus.nodes[2])
+    hostile = Hostile(2, bus, answer)
+    bus.nodes = (bus.nodes[0], hostile, bus.nodes[2])
     begun_ns = bus.clock.now_ns
     with network:
         found = network.scan(wait_s=0.05)
-    assert [node.node_id for node in found] == [1, 2, 3]
+    node_ids = [node.node_id for node in found]
+    assert node_ids == [1, 2, 3]
     assert [node.identity is not None and node.device_name == "axis" for node in found[::2]] == [
         True,
         True,
     ]
-    assert [node.problems for node in found[::2]] == [(), ()]
+    problems = [node.problems for node in found[::2]]
+    assert problems == [(), ()]
     assert any(re.search(problem, text) for text in found[1].problems)
     assert bus.clock.now_ns - begun_ns < 5_000_000_000
 
@@ -46,9 +49,12 @@ def test_a_scan_of_many_nodes_that_do_not_end_ends() -> None:
     begun_ns = bus.clock.now_ns
     with network:
         found = network.scan(wait_s=0.05)
-    assert bus.clock.now_ns - begun_ns < (SCAN_S + 10.0) * 1e9
-    assert [node.node_id for node in found] == list(range(1, 41))
-    assert "the scan was over after 30 s; is the bus flooded?" in found[-1].problems[0]
+    elapsed_ns = bus.clock.now_ns - begun_ns
+    assert elapsed_ns < (SCAN_S + 10.0) * 1e9
+    expected = list(range(1, 41))
+    assert [node.node_id for node in found] == expected
+    problems = found[-1].problems
+    assert "the scan was over after 30 s; is the bus flooded?" in problems[0]
 
 
 def test_an_object_of_unbounded_length_is_no_reason_to_ask_again() -> None:
@@ -60,16 +66,10 @@ def test_an_object_of_unbounded_length_is_no_reason_to_ask_again() -> None:
         ):
             network.link.objects(1).read_bytes(NAME, 0)
         assert network.link.objects(1).read(ObjectEntry(0x6075, 0, 32, signed=False)) == 2000
-    assert (
-        len(
-            [
-                frame
-                for frame in bus.sent
-                if frame.data[0] == 0x40 and about(bytes(frame.data)) == NAME
-            ]
-        )
-        == 1
-    )
+    frames = [
+        frame for frame in bus.sent if frame.data[0] == 0x40 and about(bytes(frame.data)) == NAME
+    ]
+    assert len(frames) == 1
 
 
 def test_a_slow_node_is_said_to_be_slow() -> None:
@@ -100,7 +100,8 @@ class BlockServer(ScriptedNode):
 
     def sdo(self, data: bytes) -> bytes | None:
         if data[0] >> 5 != 5:
-            refused = bytes((0x80, *data[1:4])) + struct.pack("<L", 0x05040001)
+            packed = struct.pack("<L", 0x05040001)
+            refused = bytes((0x80, *data[1:4])) + packed
             if about(data) == NAME:
                 return refused
             return super().sdo(data)
@@ -117,7 +118,8 @@ class BlockServer(ScriptedNode):
         for number, segment in enumerate(self._rest[:127], start=1):
             last = 0x80 if number == len(self._rest) else 0
             frame = bytes((number | last,)) + segment.ljust(7, b"\0")
-            self._bus.inject(can.Message(arbitration_id=0x581, is_extended_id=False, data=frame))
+            message = can.Message(arbitration_id=0x581, is_extended_id=False, data=frame)
+            self._bus.inject(message)
         return None
 
 
@@ -125,7 +127,8 @@ def test_an_object_that_comes_by_block_transfer_alone_is_read_so() -> None:
     network, bus = cell(1)
     bus.nodes = (BlockServer(bus),)
     with network:
-        assert network.link.objects(1).read_bytes(NAME, 0) == TEXT
+        content = network.link.objects(1).read_bytes(NAME, 0)
+        assert content == TEXT
 
 
 def test_a_block_transfer_with_a_wrong_checksum_is_not_believed() -> None:
@@ -151,7 +154,8 @@ def test_two_devices_with_one_node_id_are_found(serial: int) -> None:
     network, _ = twins(serial)
     with network:
         found = network.scan(wait_s=0.05)
-    assert [(node.node_id, bool(node.shared)) for node in found] == [(1, False), (2, True)]
+    expected = [(1, False), (2, True)]
+    assert [(node.node_id, bool(node.shared)) for node in found] == expected
     assert "two answers to one request for 10" in found[1].shared
 
 
@@ -225,7 +229,8 @@ def listen(network: CanopenNetwork, bus: ScriptedBus, states: list[int], every_n
 def test_two_boot_ups_right_after_another_are_two_devices() -> None:
     network, bus = cell(2)
     with network:
-        link = listen(network, bus, [0, 0, 127], 50_000_000)
+        states = [0, 0, 127]
+        link = listen(network, bus, states, 50_000_000)
         assert link.shared_id(2, 0) == "2 boot-up messages within 0.5 s"
         assert link.shared_id(1, 0) == ""
 
@@ -233,14 +238,17 @@ def test_two_boot_ups_right_after_another_are_two_devices() -> None:
 def test_a_node_that_boots_again_later_is_one_device() -> None:
     network, bus = cell(2)
     with network:
-        assert listen(network, bus, [0, 127, 0, 127], 300_000_000).shared_id(2, 0) == ""
+        states = [0, 127, 0, 127]
+        assert listen(network, bus, states, 300_000_000).shared_id(2, 0) == ""
 
 
 @pytest.mark.parametrize(("every_ms", "shared"), [(50, True), (100, False)])
 def test_two_heartbeats_a_period_are_two_devices(every_ms: int, shared: bool) -> None:
     network, bus = cell(2)
     with network:
-        link = listen(network, bus, [5] * 30, every_ms * 1_000_000)
+        states = [5] * 30
+        every_ns = every_ms * 1_000_000
+        link = listen(network, bus, states, every_ns)
         assert bool(link.shared_id(2, 100)) is shared
         assert (link.shared_id(2, 100) == "8 heartbeats in 350 ms, its period is 100 ms") is shared
 
@@ -249,7 +257,8 @@ def test_one_late_heartbeat_is_no_second_device() -> None:
     network, bus = cell(2)
     with network:
         for every_ms in (100, 100, 190, 10, 100, 100, 100):
-            link = listen(network, bus, [5], every_ms * 1_000_000)
+            every_ns = every_ms * 1_000_000
+            link = listen(network, bus, [5], every_ns)
         assert link.shared_id(2, 100) == ""
 
 
@@ -257,7 +266,8 @@ def test_heartbeats_of_two_states_in_turn_are_two_devices() -> None:
     network, bus = cell(2)
     with network:
         # One change may be commanded
-        assert listen(network, bus, [5, 127, 5], 100_000_000).shared_id(2, 0) == ""
+        states = [5, 127, 5]
+        assert listen(network, bus, states, 100_000_000).shared_id(2, 0) == ""
         assert listen(network, bus, [127, 5], 100_000_000).shared_id(2, 0) == (
             "heartbeats OPERATIONAL and PRE-OPERATIONAL in turn"
         )
@@ -273,7 +283,8 @@ def listen_beside_sync(
     """Hear heartbeats, each behind a SYNC of another producer."""
     for _ in range(beats):
         bus.inject(sync())
-        listen(network, bus, [5], every_ms * 1_000_000)
+        every_ns = every_ms * 1_000_000
+        listen(network, bus, [5], every_ns)
     return network.link
 
 
@@ -288,7 +299,8 @@ def test_two_devices_are_found_by_their_heartbeats_once_no_sync_is_between_them(
     network, bus = cell(2)
     with network:
         assert listen_beside_sync(network, bus, 30, 20).shared_id(2, 100) == ""
-        link = listen(network, bus, [5] * 8, 50_000_000)
+        states = [5] * 8
+        link = listen(network, bus, states, 50_000_000)
         assert link.shared_id(2, 100) == "8 heartbeats in 350 ms, its period is 100 ms"
 
 
@@ -298,7 +310,8 @@ def test_two_devices_are_found_by_their_answers_beside_sync(serial: int) -> None
     bus.tamper = lambda message: (message, sync())
     with network:
         found = scan_link(network.link, range(1, 5), 0.05)
-    assert [(node.node_id, bool(node.shared)) for node in found] == [(1, False), (2, True)]
+    expected = [(1, False), (2, True)]
+    assert [(node.node_id, bool(node.shared)) for node in found] == expected
     assert "two answers to one request for 10" in found[1].shared
 
 
@@ -378,10 +391,8 @@ def test_a_silent_twin_is_found_by_its_heartbeats(period_ms: int) -> None:
     begun_ns = bus.clock.now_ns
     with network:
         found = network.scan(wait_s=0.05)
-    assert [(node.node_id, "heartbeats in" in node.shared) for node in found] == [
-        (1, False),
-        (2, True),
-    ]
+    expected = [(1, False), (2, True)]
+    assert [(node.node_id, "heartbeats in" in node.shared) for node in found] == expected
     assert bus.clock.now_ns - begun_ns < 4_000_000_000
 
 
@@ -404,7 +415,8 @@ def test_a_silent_twin_is_refused_before_motion() -> None:
         ),
     ):
         network.prepare()
-    assert [node.powered_cycles for node in bus.nodes] == [0, 0, 0]
+    powered_cycles = [node.powered_cycles for node in bus.nodes]
+    assert powered_cycles == [0, 0, 0]
 
 
 @pytest.mark.parametrize("timed", [True, False])
@@ -438,14 +450,12 @@ def test_an_answer_to_another_program_is_no_second_device() -> None:
     with network:
         access = network.link.objects(1)
         for _ in range(3):
-            access.read(ObjectEntry(0x6075, 0, 32, signed=False))
-            bus.inject(
-                can.Message(
-                    arbitration_id=0x601,
-                    is_extended_id=False,
-                    data=bytes.fromhex("4075600000000000"),
-                )
+            object_entry = ObjectEntry(0x6075, 0, 32, signed=False)
+            access.read(object_entry)
+            message = can.Message(
+                arbitration_id=0x601, is_extended_id=False, data=bytes.fromhex("4075600000000000")
             )
+            bus.inject(message)
             answer = can.Message(
                 arbitration_id=0x581, is_extended_id=False, data=bytes.fromhex("43756000d0070000")
             )
@@ -459,5 +469,6 @@ def test_a_late_answer_to_a_request_that_was_repeated_is_no_second_device() -> N
     with network:
         access = network.link.objects(1)
         for _ in range(3):
-            access.read(ObjectEntry(0x6075, 0, 32, signed=False))
+            object_entry = ObjectEntry(0x6075, 0, 32, signed=False)
+            access.read(object_entry)
         assert network.link.shared_id(1, 0) == ""

@@ -111,7 +111,8 @@ def test_no_setting_of_the_wall_clock_moves_a_stamp(
     once the clock is set while one waits.
     """
     now_ns = offset_ns = last_ns = 10**18
-    time = MonotonicTime(now_ns + offset_ns, now_ns)
+    wall_ns = now_ns + offset_ns
+    time = MonotonicTime(wall_ns, now_ns)
     for number, (gap_ns, wait_ns) in enumerate(frames):
         true_ns = now_ns + gap_ns
         stamp_ns = true_ns + offset_ns
@@ -190,7 +191,8 @@ def test_a_stamp_of_0_is_a_stamp(monkeypatch: pytest.MonkeyPatch) -> None:
         before_ns = time.time_ns()
         assert capture.receive() == 0
         assert capture.forward()
-        records = RECORD.iter_unpack(parent.recv(1 << 20))
+        timeout = 1 << 20
+        records = RECORD.iter_unpack(parent.recv(timeout))
         stamped_ns, unstamped_ns = (record[0] for record in records)
     assert stamped_ns == 0
     assert unstamped_ns >= before_ns
@@ -203,7 +205,8 @@ def test_a_stamp_of_0_is_a_stamp(monkeypatch: pytest.MonkeyPatch) -> None:
 )
 def test_a_bus_is_behind_until_it_has_read_to_a_time(until_ns: int | None, behind: bool) -> None:
     bus = SimpleNamespace(read_until_ns=until_ns)
-    assert lags_behind(cast("can.BusABC", bus), 5) is behind
+    lags = lags_behind(cast("can.BusABC", bus), 5)
+    assert lags is behind
 
 
 def test_a_full_backlog_is_counted_to_the_frame() -> None:
@@ -225,7 +228,8 @@ def test_a_full_backlog_is_counted_to_the_frame() -> None:
         chunks = b""
         while capture.forward():
             try:
-                chunks += parent.recv(1 << 20)
+                timeout = 1 << 20
+                chunks += parent.recv(timeout)
             except BlockingIOError:
                 break
         reported = list(RECORD.iter_unpack(chunks))
@@ -369,7 +373,8 @@ def test_a_full_transmit_queue_is_waited_for_and_then_named(
             raise OSError(number, "full")
 
     monkeypatch.setattr(bus, "_socket", Full())
-    bus.send(can.Message(arbitration_id=1, is_extended_id=False))
+    message = can.Message(arbitration_id=1, is_extended_id=False)
+    bus.send(message)
     assert tries == 3
     with pytest.raises(can.CanOperationError, match="does any node acknowledge"):
         bus.send(can.Message(arbitration_id=1, is_extended_id=False), timeout=0.001)
@@ -383,15 +388,15 @@ def test_the_filter_passes_all_that_is_watched(monkeypatch: pytest.MonkeyPatch) 
     with network:
         network.prepare()
     commands = {0x000, 0x080, 0x7E4, 0x7E5, *range(0x601, 0x680)}
-    of_axes = {
-        service + node for service in (0x080, *range(0x180, 0x600, 0x80), 0x700) for node in (1, 2)
-    }
+    of_axes = set()
+    for service in (0x080, *range(0x180, 0x600, 0x80), 0x700):
+        for node in (1, 2):
+            of_axes.add(service + node)
     own = {service + network.recorder_id for service in range(0x080, 0x780, 0x80)}
-    passed = {
-        number
-        for number in range(0x800)
-        if any((number ^ wanted) & mask == 0 for wanted, mask in filters)
-    }
+    passed = set()
+    for number in range(0x800):
+        if any((number ^ wanted) & mask == 0 for wanted, mask in filters):
+            passed.add(number)
     assert (commands | of_axes | own) - passed == set()
     assert {
         0x181 + 0x20,

@@ -83,13 +83,13 @@ class Pair:
         self.clock = FakeClock()
         self.log: list[tuple[str, int]] = []
         self.left, self.right = (Wire(name, self.log, self.clock) for name in NAMES)
-        self.address = SplitAddress(
-            tuple(
-                BusPart(name, BusAddress("scripted", name), nodes, {1: "J1"})
-                for name, nodes in zip(NAMES, (LEFT, RIGHT), strict=True)
-            )
+        parts = tuple(
+            BusPart(name, BusAddress("scripted", name), nodes, {1: "J1"})
+            for name, nodes in zip(NAMES, (LEFT, RIGHT), strict=True)
         )
-        self.bus = SplitBus(self.address, (self.left, self.right), lambda: self.clock.now_ns * 1e-9)
+        self.address = SplitAddress(parts)
+        ends = (self.left, self.right)
+        self.bus = SplitBus(self.address, ends, lambda: self.clock.now_ns * 1e-9)
 
 
 @pytest.fixture
@@ -124,9 +124,10 @@ def _split(kind: type[SplitBus], address: SplitAddress) -> SplitBus:
 
 def _three(one: BusAddress, other: BusAddress) -> Iterator[Ends]:
     low = frozenset(range(1, 64))
-    address = SplitAddress(
-        (BusPart("low", one, low), BusPart("high", other, frozenset(range(64, 128))))
-    )
+    node_ids = frozenset(range(64, 128))
+    bus_part = BusPart("low", one, low)
+    parts = (bus_part, BusPart("high", other, node_ids))
+    address = SplitAddress(parts)
     ends = _split(SplitBus, address), _split(FarEnd, address), _split(FarEnd, address)
     try:
         yield ends
@@ -139,16 +140,17 @@ class TestSplitVirtual(BusContract):
     @pytest.fixture
     def ends(self, request: pytest.FixtureRequest) -> Iterator[Ends]:
         name = request.node.nodeid
-        yield from _three(
-            BusAddress("virtual", name + "-low"), BusAddress("virtual", name + "-high")
-        )
+        channel = name + "-low"
+        bus_address = BusAddress("virtual", name + "-high")
+        yield from _three(BusAddress("virtual", channel), bus_address)
 
 
 def test_every_frame_goes_to_the_bus_of_its_node(pair: Pair) -> None:
     expected = []
     for service in (0x080, 0x180, 0x200, 0x300, 0x400, 0x580, 0x600, 0x700):
         for node_id, name in ((1, "left"), (2, "right")):
-            pair.bus.send(frame(service + node_id))
+            identifier = service + node_id
+            pair.bus.send(frame(identifier))
             expected.append((name, service + node_id))
     for node_id, name in ((1, "left"), (2, "right")):
         pair.bus.send(frame(0x000, data=bytes((NmtCommand.START, node_id))))
@@ -166,12 +168,15 @@ def test_what_concerns_everybody_goes_to_all(pair: Pair) -> None:
     ):
         pair.log.clear()
         pair.bus.send(message)
-        assert pair.log == [(name, message.arbitration_id) for name in NAMES]
+        expected = [(name, message.arbitration_id) for name in NAMES]
+        assert pair.log == expected
 
 
 def test_the_syncs_of_a_burst_follow_each_other_behind_all_setpoints(pair: Pair) -> None:
-    send_burst(pair.bus, [*(frame(0x200 + node) for node in range(1, 7)), frame(0x080)])
-    assert pair.log[-2:] == [("left", 0x080), ("right", 0x080)]
+    messages = [*(frame(0x200 + node) for node in range(1, 7)), frame(0x080)]
+    send_burst(pair.bus, messages)
+    expected = [("left", 0x080), ("right", 0x080)]
+    assert pair.log[-2:] == expected
     assert pair.log[:6] == [(NAMES[(node + 1) % 2], 0x200 + node) for node in range(1, 7)]
 
 
@@ -191,7 +196,8 @@ def test_received_frames_come_in_the_order_of_their_time_stamps(
     received = []
     while (message := pair.bus.recv(0.0)) is not None:
         received.append(message)
-    assert [message.timestamp for message in received] == sorted([*left, *right])
+    expected = sorted([*left, *right])
+    assert [message.timestamp for message in received] == expected
     for identifier, stamps in ((0x181, left), (0x182, right)):
         numbers = [
             int.from_bytes(m.data, "big") for m in received if m.arbitration_id == identifier
@@ -214,8 +220,10 @@ def test_waiting_at_one_bus_never_lasts_while_the_other_may_have_frames(pair: Pa
     """Neither has a file descriptor, as python-can's virtual bus."""
     begun_ns = pair.clock.now_ns
     assert pair.bus.recv(0.1) is None
-    assert pair.clock.now_ns - begun_ns == pytest.approx(0.1e9, abs=1e6)
-    assert max(pair.left.asked_s + pair.right.asked_s) < 0.001
+    elapsed_ns = pair.clock.now_ns - begun_ns
+    assert elapsed_ns == pytest.approx(0.1e9, abs=1e6)
+    largest_asked_s = max(pair.left.asked_s + pair.right.asked_s)
+    assert largest_asked_s < 0.001
     assert sum(pair.left.asked_s) == pytest.approx(sum(pair.right.asked_s), abs=0.001)
 
 
@@ -233,7 +241,8 @@ def test_buses_with_file_descriptors_are_waited_for_together(name: str) -> None:
             far.send(frame(0x201))
             heard = bus.recv(WAIT_S)
             assert heard is not None
-            assert heard.channel == f"{name} ({hub.address(name)})"
+            expected = f"{name} ({hub.address(name)})"
+            assert heard.channel == expected
         finally:
             bus.shutdown()
             far.shutdown()
@@ -278,7 +287,8 @@ def test_frames_behind_one_that_is_left_out_are_not_waited_for(pair: Pair) -> No
         bus = SplitBus(pair.address, ends)
         echo = frame(0x080)
         echo.is_rx = False
-        ends[1].coming.extend((echo, frame(0x184)))
+        coming = ends[1].coming
+        coming.extend((echo, frame(0x184)))
         assert bus.recv(0.0) is not None
         bus.shutdown()
 
@@ -300,10 +310,12 @@ def test_a_bus_that_fails_is_named_once_and_the_other_goes_on(
         pair.bus.send(frame(0x080)) if sending else pair.bus.recv(0.0)
     assert pair.log == ([(sound.name, 0x080)] if sending else [])  # the others got it all the same
     pair.log.clear()
-    send_burst(pair.bus, [*(frame(0x200 + node) for node in range(1, 7)), frame(0x080)])
+    messages = [*(frame(0x200 + node) for node in range(1, 7)), frame(0x080)]
+    send_burst(pair.bus, messages)
     assert {name for name, _ in pair.log} == {sound.name}
     assert len(pair.log) == 4
-    sound.coming.append(frame(0x180 + node_id))
+    identifier = 0x180 + node_id
+    sound.coming.append(frame(identifier))
     assert pair.bus.recv(0.0) is not None
     sound.broken = True
     with pytest.raises(BusError, match=sound.name):
@@ -375,8 +387,10 @@ def test_a_bus_that_cannot_be_opened_is_named_and_the_others_are_closed(
         return opened[-1]
 
     monkeypatch.setattr("drivers.canopen.split_bus.open_bus", remember)
+    bus_address = BusAddress("virtual", "opened first")
+    bus_part = BusPart("left", bus_address, LEFT)
     parts = (
-        BusPart("left", BusAddress("virtual", "opened first"), LEFT),
+        bus_part,
         BusPart("right", BusAddress("carrier-pigeon", "can1"), RIGHT),
     )
     with pytest.raises(BusError, match=r"right \(carrier-pigeon:can1\)"):
@@ -410,9 +424,11 @@ def test_frames_of_two_buses_come_in_the_order_of_the_monotonic_clock(
     """
     for number, wire in enumerate((pair.left, pair.right, pair.left, pair.right)):
         at_ns = 5_000_000_000 + 100 * number
+        timestamp = 1.7e9 + at_ns * 1e-9 + step_s * number
+        arbitration_id = 0x700 + number % 2 + 1
         message = CapturedMessage(
-            timestamp=1.7e9 + at_ns * 1e-9 + step_s * number,
-            arbitration_id=0x700 + number % 2 + 1,
+            timestamp=timestamp,
+            arbitration_id=arbitration_id,
             is_extended_id=False,
             data=bytes((number,)),
         )
@@ -421,4 +437,5 @@ def test_frames_of_two_buses_come_in_the_order_of_the_monotonic_clock(
         message.local = False
         wire.coming.append(message)
     got = [pair.bus.recv(0.0) for _ in range(4)]
-    assert [message.data[0] for message in got if message is not None] == [0, 1, 2, 3]
+    expected = [0, 1, 2, 3]
+    assert [message.data[0] for message in got if message is not None] == expected

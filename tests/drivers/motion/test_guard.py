@@ -46,7 +46,8 @@ def test_an_amplifier_watches_the_recorder_and_gets_its_settings_back(before: in
 
 def test_what_an_amplifier_lacks_is_said() -> None:
     network, bus = cell(3)
-    give_guard(bus.nodes[1], option=None)
+    node = bus.nodes[1]
+    give_guard(node, option=None)
     # It watches another device, and must not be changed
     give_guard(bus.nodes[2], entry=0x0005_01F4)
     with network:
@@ -107,11 +108,13 @@ def test_our_heartbeat_comes_in_its_period_while_axes_have_power_and_at_no_other
     bus.send = listen  # type: ignore[method-assign]
     with network:
         network.prepare()
-        stream = SyncStream(network, LockstepSync(PERIOD_NS, 0.005, clock=bus.clock))
+        pacing = LockstepSync(PERIOD_NS, 0.005, clock=bus.clock)
+        stream = SyncStream(network, pacing)
         for _ in range(100):
             next(stream)
         assert not beats_ns
-        move = Move((50_000, -40_000), (100_000, 80_000), (1_000_000, 800_000))
+        target_counts = (50_000, -40_000)
+        move = Move(target_counts, (100_000, 80_000), (1_000_000, 800_000))
         list(execute(network, stream, (move,), permission()))
         count = len(beats_ns)
         assert count > 5
@@ -153,7 +156,8 @@ def test_a_node_id_that_another_device_uses_is_not_the_recorder_s(
     network, bus = cell(2)
     for node in bus.nodes:
         # And it is not a recorder's that was killed, though it looks like one
-        give_guard(node, RECORDER << 16 | 500)
+        entry = RECORDER << 16 | 500
+        give_guard(node, entry)
         node.objects[0x1016, 0], node.objects[0x1016, 2] = (2, 1), (0, 4)
     join(bus, 127, beat_ms=beat_ms, answers=answers)
     join(bus, 126, beat_ms=beat_ms, answers=answers)
@@ -161,9 +165,12 @@ def test_a_node_id_that_another_device_uses_is_not_the_recorder_s(
         network.prepare()
         assert network.recorder_id == 125
         watched = [[node.value(0x1016, sub) for sub in (1, 2)] for node in bus.nodes[:2]]
-        assert watched == [[RECORDER << 16 | 500, 125 << 16 | 500]] * 2
-        stream = SyncStream(network, LockstepSync(PERIOD_NS, 0.005, clock=bus.clock))
-        move = Move((50_000, -40_000), (100_000, 80_000), (1_000_000, 800_000))
+        expected = [[RECORDER << 16 | 500, 125 << 16 | 500]] * 2
+        assert watched == expected
+        pacing = LockstepSync(PERIOD_NS, 0.005, clock=bus.clock)
+        stream = SyncStream(network, pacing)
+        target_counts = (50_000, -40_000)
+        move = Move(target_counts, (100_000, 80_000), (1_000_000, 800_000))
         list(execute(network, stream, (move,), permission()))
         beats = {frame.arbitration_id for frame in bus.sent if frame.arbitration_id > 0x700}
         assert beats == {0x700 + 125}
@@ -188,7 +195,8 @@ def test_a_node_id_that_an_amplifier_waits_for_is_left_to_the_device_that_is_off
 def test_what_a_killed_recorder_left_under_another_id_is_used_again() -> None:
     """Another device had the highest id at that time."""
     network, bus = cell(1)
-    give_guard(bus.nodes[0], 126 << 16 | 500)
+    entry = 126 << 16 | 500
+    give_guard(bus.nodes[0], entry)
     with network:
         network.prepare()
         assert bus.nodes[0].value(0x1016, 1) == RECORDER << 16 | 500
@@ -241,14 +249,17 @@ def test_a_device_with_our_node_id_that_comes_before_the_run_refuses_it(frame: c
     network, bus = cell(2)
     with network:
         network.prepare()
-        stream = SyncStream(network, LockstepSync(PERIOD_NS, 0.005, clock=bus.clock))
+        pacing = LockstepSync(PERIOD_NS, 0.005, clock=bus.clock)
+        stream = SyncStream(network, pacing)
         bus.inject(frame)
+        move = Move((50_000, 0), (100_000, 100_000), (1_000_000, 1_000_000))
+        moves = (move,)
         with pytest.raises(BusBusy, match="77Fh of another device, which has node id 127 too"):
             list(
                 execute(
                     network,
                     stream,
-                    (Move((50_000, 0), (100_000, 100_000), (1_000_000, 1_000_000)),),
+                    moves,
                     permission(),
                 )
             )
@@ -285,7 +296,8 @@ def test_any_frame_with_our_node_id_and_any_lss_frame_stops_the_axes(
         network.prepare()
         bus.cycle = -1
         bus.on_cycle = lambda cycle: bus.inject(frame) if cycle == 60 else None
-        stream = SyncStream(network, LockstepSync(PERIOD_NS, 0.005, clock=bus.clock))
+        pacing = LockstepSync(PERIOD_NS, 0.005, clock=bus.clock)
+        stream = SyncStream(network, pacing)
         with pytest.raises(BusBusy, match=words):
             list(execute(network, stream, (MOVE,), permission()))
         assert bus.cycle < 70
@@ -309,7 +321,8 @@ def test_another_master_that_writes_stops_the_axes(command: int) -> None:
         bus.on_cycle = lambda cycle: (
             bus.inject(reading if cycle < 60 else writing) if cycle in (50, 60) else None
         )
-        stream = SyncStream(network, LockstepSync(PERIOD_NS, 0.005, clock=bus.clock))
+        pacing = LockstepSync(PERIOD_NS, 0.005, clock=bus.clock)
+        stream = SyncStream(network, pacing)
         with pytest.raises(
             BusBusy,
             match=r"an SDO download \(it writes\) to J2 \(node "
@@ -329,22 +342,25 @@ def test_another_master_that_only_reads_is_an_event_and_named_behind_a_late_move
     network, bus = cell(2)
     for node in bus.nodes:
         give_guard(node)
+    arbitration_id = 0x600 + node_id
     frame = can.Message(
-        arbitration_id=0x600 + node_id, is_extended_id=False, data=bytes((command, *bytes(7)))
+        arbitration_id=arbitration_id, is_extended_id=False, data=bytes((command, *bytes(7)))
     )
     events: list[CellEvent] = []
     with network:
         network.prepare()
         bus.cycle = -1
         bus.on_cycle = lambda cycle: bus.inject(frame) if cycle == 60 else None
-        stream = SyncStream(network, LockstepSync(PERIOD_NS, 0.005, clock=bus.clock), events.append)
+        pacing = LockstepSync(PERIOD_NS, 0.005, clock=bus.clock)
+        stream = SyncStream(network, pacing, events.append)
         for _ in execute(network, stream, (MOVE,), permission()):
             pass
         assert (
             f"an SDO request to {'J2 (node 2)' if node_id == 2 else 'node 9'} "
             f"(60{node_id}h)" in network.other_master()
         )
-    assert [event.code for event in events if event.kind is EventKind.BUS_BUSY] == [0x600 + node_id]
+    codes = [event.code for event in events if event.kind is EventKind.BUS_BUSY]
+    assert codes == [0x600 + node_id]
     late = MotionTimeout(0, (1,), (), 1.0, other_master=network.other_master())
     assert "another master was on the bus: an SDO request" in str(late)
     assert "end the other program first; else check brakes" in str(late)
@@ -352,7 +368,8 @@ def test_another_master_that_only_reads_is_an_event_and_named_behind_a_late_move
 
 def test_axes_without_guard_are_named() -> None:
     network, bus = cell(2)
-    give_guard(bus.nodes[0], option=None)
+    node = bus.nodes[0]
+    give_guard(node, option=None)
     with network:
         network.prepare()
         assert network.without_guard() == ("J2",)
@@ -368,7 +385,11 @@ def test_a_device_with_our_node_id_that_joins_in_the_run_stops_the_axes(frame: c
         network.prepare()
         bus.cycle = -1
         bus.on_cycle = lambda cycle: bus.inject(frame) if cycle in (60, 61) else None
-        stream = SyncStream(network, LockstepSync(PERIOD_NS, 0.005, clock=bus.clock), events.append)
+        pacing = LockstepSync(PERIOD_NS, 0.005, clock=bus.clock)
+        stream = SyncStream(network, pacing, events.append)
+        target_counts = (50_000, -40_000)
+        move = Move(target_counts, (100_000, 80_000), (1_000_000, 800_000))
+        moves = (move,)
         with pytest.raises(
             BusBusy,
             match=r"found a heartbeat 77Fh .*expected an id .*give that "
@@ -378,11 +399,12 @@ def test_a_device_with_our_node_id_that_joins_in_the_run_stops_the_axes(frame: c
                 execute(
                     network,
                     stream,
-                    (Move((50_000, -40_000), (100_000, 80_000), (1_000_000, 800_000)),),
+                    moves,
                     permission(),
                 )
             )
         assert bus.cycle < 70
         assert [node.statusword & 0x6F for node in bus.nodes] == [0x40, 0x40]
-        assert [event.code for event in events if event.kind is EventKind.BUS_BUSY] == [0x77F]
+        codes = [event.code for event in events if event.kind is EventKind.BUS_BUSY]
+        assert codes == [0x77F]
     assert [abs(node.position) < 40_000 for node in bus.nodes] == [True, True]

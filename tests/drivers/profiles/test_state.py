@@ -89,7 +89,8 @@ def test_at_most_one_state_matches_and_other_bits_do_not_matter(statusword: int)
 def test_every_way_ends_at_its_goal(state: State, goal: Goal) -> None:
     way = [state]
     for _ in range(5):
-        way.append(transition(way[-1], next_command(way[-1], goal)))
+        command = next_command(way[-1], goal)
+        way.append(transition(way[-1], command))
     ends = {
         Goal.OPERATION_ENABLED: State.OPERATION_ENABLED,
         Goal.SWITCH_ON_DISABLED: State.SWITCH_ON_DISABLED,

@@ -36,7 +36,8 @@ def begin_move(
     master: Master, spec: CellSpec, target: FloatArray, duration_s: float, ramp_s: float
 ) -> None:
     """A synchronised trapezoid; it starts with the next SYNC."""
-    speed = (target - spec.start_rad) / (duration_s - ramp_s)
+    target_difference = target - spec.start_rad
+    speed = target_difference / (duration_s - ramp_s)
     rows = zip(counts(spec, target), counts(spec, speed), counts(spec, speed / ramp_s), strict=True)
     for node_id, (place, velocity, acceleration) in enumerate(rows, start=1):
         settings = [(0x607A, "i", place), (0x6081, "I", abs(velocity))]
@@ -70,15 +71,19 @@ def test_a_fast_move_is_followed_and_reached(
             if cycle % 20 == 0:
                 errors.append([master.read(node_id, 0x60F4, 0, "i") for node_id in SIX])
         ends = np.array(counts(spec, target))
-        found = np.array([position for position, _, _ in answer])
+        positions = [position for position, _, _ in answer]
+        found = np.array(positions)
     moving = np.array(words)[: int(1000 * duration_s) - 1]
     assert (moving & ACKNOWLEDGED).all()
     assert not (moving & REACHED).any()
     assert (np.array(words)[-1] & REACHED).all()
     assert not (np.array(words) & (LIMITED | FOLLOWING_ERROR | 0x08)).any()
-    reduction = np.abs(np.max(np.abs(spec.ratio), axis=1))
+    absolute_ratio = np.abs(spec.ratio)
+    largest_absolute_ratio = np.max(absolute_ratio, axis=1)
+    reduction = np.abs(largest_absolute_ratio)
     assert (np.abs(errors).max(axis=0) < np.deg2rad(1.0) * reduction * 65536 / (2 * np.pi)).all()
-    assert (np.abs(found - ends) <= 655).all()
+    difference = np.abs(found - ends)
+    assert (difference <= 655).all()
 
 
 def test_equal_frames_give_equal_bytes_and_another_seed_gives_others(
@@ -88,7 +93,8 @@ def test_equal_frames_give_equal_bytes_and_another_seed_gives_others(
         with running(spec, request.node.name) as (_, master):
             master.set_up(SIX)
             master.enable(SIX)
-            begin_move(master, spec, spec.start_rad + 0.3, 0.25, 0.1)
+            target = spec.start_rad + 0.3
+            begin_move(master, spec, target, 0.25, 0.1)
             for _ in range(120):
                 master.sync()
             return master.answers
@@ -97,7 +103,8 @@ def test_equal_frames_give_equal_bytes_and_another_seed_gives_others(
     first = story(spec)
     assert len(first) == 6 * 123
     assert story(spec) == first
-    assert story(replace(spec, seed=2)) != first
+    changed_spec = replace(spec, seed=2)
+    assert story(changed_spec) != first
 
 
 def test_brakes_hold_until_operation_is_enabled(request: pytest.FixtureRequest) -> None:
@@ -109,7 +116,8 @@ def test_brakes_hold_until_operation_is_enabled(request: pytest.FixtureRequest) 
         for controlword in (0x06, 0x07):
             master.control(SIX, controlword)
             for _ in range(50):
-                assert [position for position, _, _ in master.sync()] == start
+                positions = [position for position, _, _ in master.sync()]
+                assert positions == start
 
 
 def test_one_sync_is_one_sample_period(request: pytest.FixtureRequest) -> None:
@@ -131,10 +139,12 @@ def test_a_following_error_is_a_fault_with_its_emergency_and_can_be_reset(
         master.enable(SIX)
         assert master.write(2, 0x6065, 0, "I", 3) == 0
         assert master.write(2, 0x6066, 0, "H", 2) == 0
-        begin_move(master, spec, spec.start_rad + 0.5, 0.3, 0.1)
+        target = spec.start_rad + 0.5
+        begin_move(master, spec, target, 0.3, 0.1)
         for _ in range(100):
             answer = master.sync()
-        assert (0x082, struct.pack("<HB5x", 0x8611, 1)) in master.others
+        packed = struct.pack("<HB5x", 0x8611, 1)
+        assert (0x082, packed) in master.others
         assert answer[1][2] & 0x4F == 0x08
         assert answer[1][2] & FOLLOWING_ERROR
         assert master.read(2, 0x603F, 0, "H") == 0x8611
@@ -142,7 +152,8 @@ def test_a_following_error_is_a_fault_with_its_emergency_and_can_be_reset(
         held = answer[1][0]
         for _ in range(50):
             answer = master.sync()
-        assert abs(answer[1][0] - held) <= 2  # its brake holds it while the other axes move on
+        answer_difference = answer[1][0] - held
+        assert abs(answer_difference) <= 2  # its brake holds it while the other axes move on
         master.send(0x202, struct.pack("<H", 0x80))
         assert master.sync()[1][2] & 0x6F == 0x40
         assert master.read(2, 0x1001, 0, "B") == 0
@@ -157,7 +168,8 @@ def test_saturation_is_reported_in_bit_11_and_the_reference_stays_at_the_limit(
         master.set_up(SIX)
         assert master.write(1, 0x6073, 0, "H", 200) == 0  # 0.4 A cannot follow such a move
         master.enable(SIX)
-        begin_move(master, spec, spec.start_rad + 0.5, 0.3, 0.1)
+        target = spec.start_rad + 0.5
+        begin_move(master, spec, target, 0.3, 0.1)
         words = [master.sync()[0][2] for _ in range(60)]
         actual = master.read(1, 0x6077, 0, "h")
     assert any(word & LIMITED for word in words)
@@ -174,10 +186,12 @@ def test_quick_stop_stops_and_ends_as_its_option_says(
         for node_id in SIX:
             assert master.write(node_id, 0x605A, 0, "h", option) == 0
         master.enable(SIX)
-        begin_move(master, spec, spec.start_rad + 0.8, 0.5, 0.1)
+        target = spec.start_rad + 0.8
+        begin_move(master, spec, target, 0.5, 0.1)
         for _ in range(200):
             master.sync()
-        assert np.abs(cell.plant.velocity_rad_s).min() > 0.5
+        absolute_velocity_rad_s = np.abs(cell.plant.velocity_rad_s)
+        assert absolute_velocity_rad_s.min() > 0.5
         master.control(SIX, 0x02)
         assert all(word & 0x6F == 0x07 for _, _, word in master.sync())
         for _ in range(300):
@@ -191,19 +205,23 @@ def test_a_waiting_set_point_follows_the_first(request: pytest.FixtureRequest) -
     with running(spec, request.node.name) as (_, master):
         master.set_up(SIX)
         master.enable(SIX)
-        begin_move(master, spec, spec.start_rad + 0.1, 0.2, 0.1)
+        target = spec.start_rad + 0.1
+        begin_move(master, spec, target, 0.2, 0.1)
         master.sync()
         master.control(SIX, 0x0F)
         assert not any(word & ACKNOWLEDGED for _, _, word in master.sync())
-        for node_id, place in zip(SIX, counts(spec, spec.start_rad - 0.05), strict=True):
+        joint = spec.start_rad - 0.05
+        for node_id, place in zip(SIX, counts(spec, joint), strict=True):
             assert master.write(node_id, 0x607A, 0, "i", place) == 0
         master.control(SIX, 0x1F)
         assert all(word & ACKNOWLEDGED for _, _, word in master.sync())
         for _ in range(600):
             answer = master.sync()
-        ends = counts(spec, spec.start_rad - 0.05)
+        start_rad_joint = spec.start_rad - 0.05
+        ends = counts(spec, start_rad_joint)
         assert all(word & REACHED for _, _, word in answer)
-        assert max(abs(a[0] - end) for a, end in zip(answer, ends, strict=True)) <= 655
+        largest_difference = max(abs(a[0] - end) for a, end in zip(answer, ends, strict=True))
+        assert largest_difference <= 655
 
 
 def test_nmt_stop_while_enabled_is_a_fault_and_the_brake_holds(
@@ -230,11 +248,16 @@ def test_noise_of_the_reference_is_as_declared_and_on_nothing_else() -> None:
         amplifiers.report()
         reported.append(amplifiers.reported_a.copy())
     noise = np.array(reported)
-    sigma = np.array([axis.current_noise_a for axis in spec.axes])
-    np.testing.assert_allclose(noise.std(axis=0), sigma, rtol=0.08)
-    lag_one = (noise[1:] * noise[:-1]).mean(axis=0) / noise.var(axis=0)
-    np.testing.assert_allclose(lag_one, np.exp(-0.001 / 0.005), atol=0.02)
-    assert np.abs(np.corrcoef(noise.T) - np.eye(6)).max() < 0.1
+    current_noise_a = [axis.current_noise_a for axis in spec.axes]
+    sigma = np.array(current_noise_a)
+    noise_std = noise.std(axis=0)
+    np.testing.assert_allclose(noise_std, sigma, rtol=0.08)
+    noise_variance = noise.var(axis=0)
+    lag_one = (noise[1:] * noise[:-1]).mean(axis=0) / noise_variance
+    expected = np.exp(-0.001 / 0.005)
+    np.testing.assert_allclose(lag_one, expected, atol=0.02)
+    difference = np.corrcoef(noise.T) - np.eye(6)
+    assert np.abs(difference).max() < 0.1
     assert (amplifiers.loops["current_a"] == 0.0).all()
 
 
@@ -257,10 +280,12 @@ def test_a_failure_in_the_thread_reaches_the_owner(request: pytest.FixtureReques
 def test_impossible_cells_are_refused() -> None:
     spec = clean_cell()
     with can.Bus(interface="virtual", channel="impossible") as bus:
+        axes = (spec.axes[0],) * 6
         with pytest.raises(SpecInvalid, match="node ids"):
-            SimulatedCell(replace(spec, axes=(spec.axes[0],) * 6), bus)
+            SimulatedCell(replace(spec, axes=axes), bus)
+        changed_spec = replace(spec, substeps=0)
         with pytest.raises(SpecInvalid, match="substeps"):
-            SimulatedCell(replace(spec, substeps=0), bus)
+            SimulatedCell(changed_spec, bus)
 
 
 def test_a_controlword_acts_on_the_target_in_the_same_frame(request: pytest.FixtureRequest) -> None:
@@ -277,7 +302,8 @@ def test_a_controlword_acts_on_the_target_in_the_same_frame(request: pytest.Fixt
         ):
             assert master.write(1, *step) == 0
         for controlword, target in ((0x06, 0), (0x07, 0), (0x0F, 0), (0x1F, 30_000)):
-            master.send(0x201, struct.pack("<Hi", controlword, target))
+            packed = struct.pack("<Hi", controlword, target)
+            master.send(0x201, packed)
             master.sync()
         for _ in range(500):
             answer = master.sync()

@@ -41,7 +41,8 @@ GUARD_MS = 60_000
 
 @pytest.fixture(scope="module")
 def axes() -> tuple[Axis, ...]:
-    return drive_axes(load_cell(CONFIGS / "cells" / "demo.yaml"))
+    path = CONFIGS / "cells" / "demo.yaml"
+    return drive_axes(load_cell(path))
 
 
 @pytest.fixture(params=["virtual", "socketcand"])
@@ -57,7 +58,8 @@ def address(request: pytest.FixtureRequest) -> Iterator[BusAddress]:
 def cell(address: BusAddress) -> Iterator[SimulatedCell]:
     bus: can.BusABC = open_bus(address)
     try:
-        with SimulatedCell(load_simulation(CONFIGS / "simulation" / "clean.yaml"), bus) as running:
+        path = CONFIGS / "simulation" / "clean.yaml"
+        with SimulatedCell(load_simulation(path), bus) as running:
             yield running
     finally:
         bus.shutdown()
@@ -88,17 +90,18 @@ def test_scan_prepare_move_and_give_back(address: BusAddress, axes: tuple[Axis, 
     events: list[CellEvent] = []
     with CanopenNetwork(address, axes, guard_ms=GUARD_MS, bounds=PATIENT) as network:
         found = network.scan(range(1, 20))
-        assert [(node.node_id, node.state) for node in found] == [
-            (n, State.SWITCH_ON_DISABLED) for n in range(1, 7)
-        ]
-        assert [node.identity for node in found] == [axis.identity for axis in axes]
+        expected = [(n, State.SWITCH_ON_DISABLED) for n in range(1, 7)]
+        assert [(node.node_id, node.state) for node in found] == expected
+        identities = [axis.identity for axis in axes]
+        assert [node.identity for node in found] == identities
         before = settings(network)
         network.prepare()
         assert settings(network) != before
         assert network.ampere_per_unit() == pytest.approx(
             (0.002, 0.002, 0.002, 0.0015, 0.0015, 0.0015)
         )
-        stream = SyncStream(network, LockstepSync(PERIOD_NS, 10.0), events.append)
+        pacing = LockstepSync(PERIOD_NS, 10.0)
+        stream = SyncStream(network, pacing, events.append)
         start = next(stream).position_counts
         target = tuple(
             position + step for position, step in zip(start, (1, -1, 0, 2, -2, 3), strict=True)
@@ -110,7 +113,8 @@ def test_scan_prepare_move_and_give_back(address: BusAddress, axes: tuple[Axis, 
         )
         with closing(execute(network, stream, moves, PERMISSION)) as samples:
             recorded = list(samples)
-        assert [sample.cycle for sample in recorded] == list(range(1, len(recorded) + 1))
+        cycles = [sample.cycle for sample in recorded]
+        assert cycles == list(range(1, len(recorded) + 1))
         assert stream.statistics.frames == 6 * stream.statistics.cycles
         assert (
             stream.statistics.missing
@@ -121,13 +125,15 @@ def test_scan_prepare_move_and_give_back(address: BusAddress, axes: tuple[Axis, 
         marks = [
             event for event in events if event.kind in (EventKind.MOVE_START, EventKind.MOVE_END)
         ]
-        assert [mark.code for mark in marks] == [0, 0, 1, 1]
+        codes = [mark.code for mark in marks]
+        assert codes == [0, 0, 1, 1]
         arrived = next(sample for sample in recorded if sample.time_ns == marks[1].time_ns)
         for position, wanted in zip(arrived.position_counts, target, strict=True):
             assert abs(position - wanted) < 2000
         assert any(any(sample.current_raw) for sample in recorded)
     with CanopenNetwork(address, axes, guard_ms=GUARD_MS, bounds=PATIENT) as network:
-        assert {node.state for node in network.scan(range(1, 7))} == {State.SWITCH_ON_DISABLED}
+        states = {node.state for node in network.scan(range(1, 7))}
+        assert states == {State.SWITCH_ON_DISABLED}
         assert settings(network) == before
 
 
@@ -137,12 +143,15 @@ def test_a_closed_run_leaves_no_axis_with_power(
 ) -> None:
     with CanopenNetwork(address, axes, guard_ms=GUARD_MS, bounds=PATIENT) as network:
         network.prepare()
-        stream = SyncStream(network, LockstepSync(PERIOD_NS, 10.0))
+        pacing = LockstepSync(PERIOD_NS, 10.0)
+        stream = SyncStream(network, pacing)
         start = next(stream).position_counts
-        far = synchronised_move(start, tuple(position + 300_000 for position in start), ROOM)
+        target_counts = tuple(position + 300_000 for position in start)
+        far = synchronised_move(start, target_counts, ROOM)
         with closing(execute(network, stream, (far,), PERMISSION)) as samples:
             for sample in samples:
-                if sample.position_counts[0] - start[0] > 50_000:
+                position_count_difference = sample.position_counts[0] - start[0]
+                if position_count_difference > 50_000:
                     break
         stopped = next(stream)
         assert max(stopped.position_counts[0] - start[0], 0) < 300_000
@@ -157,9 +166,11 @@ def test_an_emergency_of_a_node_stops_the_others(
     try:
         with CanopenNetwork(address, axes, guard_ms=GUARD_MS, bounds=PATIENT) as network:
             network.prepare()
-            stream = SyncStream(network, LockstepSync(PERIOD_NS, 10.0))
+            pacing = LockstepSync(PERIOD_NS, 10.0)
+            stream = SyncStream(network, pacing)
             start = next(stream).position_counts
-            far = synchronised_move(start, tuple(position + 300_000 for position in start), ROOM)
+            target_counts = tuple(position + 300_000 for position in start)
+            far = synchronised_move(start, target_counts, ROOM)
             with (
                 pytest.raises(DriveFault, match=r"J3 \(node 3\): .*2310h"),
                 closing(execute(network, stream, (far,), PERMISSION)) as samples,

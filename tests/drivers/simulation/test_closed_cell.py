@@ -26,8 +26,10 @@ def pose(plant: Plant, along: FloatArray, size: float) -> FloatArray:
     assert plant.mechanism is not None
     n = len(plant._gain)
     moved = plant._basis @ along
+    absolute_moved = np.abs(moved[:n])
+    largest_absolute_moved = absolute_moved.max()
     return plant.mechanism.closed(
-        plant.mechanism.start_rad + size * moved / np.abs(moved[:n]).max()
+        plant.mechanism.start_rad + size * moved / largest_absolute_moved
     )[:n]
 
 
@@ -39,9 +41,10 @@ def test_moves_are_reached_and_the_loops_stay_closed(
     bodies = {"five-bar": "disc", "orthoglide": "block", "dualv": "disc"}
     spec = cell(name, bodies[name] if payload else None)
     nodes = range(1, len(spec.axes) + 1)
+    along = np.array([1.0, -0.6, 0.5][: 3 if name != "five-bar" else 2])
     goal = pose(
         Plant(spec),
-        np.array([1.0, -0.6, 0.5][: 3 if name != "five-bar" else 2]),
+        along,
         0.04 if name[0] == "o" else 0.3,
     )
     duration_s = 0.4
@@ -61,10 +64,14 @@ def test_moves_are_reached_and_the_loops_stay_closed(
         master.control(nodes, 0x1F)
         answers = [master.sync(len(spec.axes)) for _ in range(450)]
         words = np.array([[word for _, _, word in answer] for answer in answers])
-        assert (words[-1] & REACHED).all()
+        last_word = words[-1]
+        assert (last_word & REACHED).all()
         assert not (words & FOLLOWING_ERROR).any()
-        found = np.array([position for position, _, _ in answers[-1]])
-        assert (np.abs(found - counts(spec, goal)) <= 655).all()
+        last_answer = answers[-1]
+        positions = [position for position, _, _ in last_answer]
+        found = np.array(positions)
+        difference = found - counts(spec, goal)
+        assert (np.abs(difference) <= 655).all()
         plant = there.plant
         assert plant.mechanism is not None
         assert np.abs(plant.mechanism.at(plant.position_rad)[0]).max() < 1e-11
@@ -77,21 +84,23 @@ def test_redundant_drives_preload_the_platform_while_their_trapezoids_disagree()
     amplifiers = AmplifierSet(spec, plant)
     assert plant.mechanism is not None
     assert (amplifiers.loops["integral_1_s"] == 0.0).all()
-    plant.set_brakes(np.zeros(4, dtype=np.bool_))
+    closed = np.zeros(4, dtype=np.bool_)
+    plant.set_brakes(closed)
     amplifiers.loops["enabled"] = 1
-    goal = pose(plant, np.array([1.0, -0.6, 0.5]), 0.4)
+    along = np.array([1.0, -0.6, 0.5])
+    goal = pose(plant, along, 0.4)
     start = np.zeros(4)
     inner = []
     for k in range(4000):
         share = min(1.0, k / 2000)
         blend = share * share * (3.0 - 2.0 * share)
-        amplifiers.loops["demand"] = amplifiers.loops["target"] = np.rint(
-            counts(spec, start + blend * (goal - start))
-        )
+        joint = start + blend * (goal - start)
+        amplifiers.loops["demand"] = amplifiers.loops["target"] = np.rint(counts(spec, joint))
         amplifiers.control(plant.motor_rad)
         plant.step(amplifiers.loops["current_a"])
         torque = plant._rows.T @ (plant._gain * amplifiers.loops["current_a"])
         hidden = np.linalg.svd(plant._basis[:4].T)[2][3]  # the null space of Aᵀ
         inner.append(abs(hidden @ torque))
     assert max(inner[:2000]) > 1.0  # [Nm]; friction of a motor is 0.3
-    assert inner[-1] < 0.5 * max(inner[:2000])
+    largest_inner = max(inner[:2000])
+    assert inner[-1] < 0.5 * largest_inner

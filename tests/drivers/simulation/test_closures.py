@@ -29,7 +29,8 @@ ALL = ("x", "y", "z", "rx", "ry", "rz")
 
 def cell(name: str, payload: str | None = None) -> CellSpec:
     """A shipped closed chain."""
-    return load_simulation(SIMULATIONS / f"{name}.yaml", payload)
+    path = SIMULATIONS / f"{name}.yaml"
+    return load_simulation(path, payload)
 
 
 def frictionless(spec: CellSpec) -> CellSpec:
@@ -41,7 +42,8 @@ def frictionless(spec: CellSpec) -> CellSpec:
 def released(spec: CellSpec) -> Plant:
     """A plant with open brakes."""
     plant = Plant(spec)
-    plant.set_brakes(np.zeros(len(spec.axes), dtype=np.bool_))
+    closed = np.zeros(len(spec.axes), dtype=np.bool_)
+    plant.set_brakes(closed)
     return plant
 
 
@@ -51,7 +53,9 @@ def posed(plant: Plant, rng: np.random.Generator) -> None:
     n = len(plant._gain)
     reach = 0.06 if "slide-x" in plant.mechanism.joints else 0.3
     moved = plant._basis @ rng.uniform(-1.0, 1.0, plant.mechanism.mobility)
-    position = plant.mechanism.start_rad + reach * moved / np.abs(moved[:n]).max()
+    absolute_moved = np.abs(moved[:n])
+    largest_absolute_moved = absolute_moved.max()
+    position = plant.mechanism.start_rad + reach * moved / largest_absolute_moved
     plant.position_rad[:] = plant.mechanism.closed(position)
     plant._settle()
 
@@ -121,12 +125,12 @@ class Constrained:
                 np.zeros((len(self.spec.axes), self.n - len(self.spec.axes))),
             ]
         )
-        rotor = rows.T @ np.diag([a.motor_inertia_kg_m2 for a in self.spec.axes]) @ rows
+        diagonal = np.diag([a.motor_inertia_kg_m2 for a in self.spec.axes])
+        rotor = rows.T @ diagonal @ rows
         c = len(jacobian)
         system = np.block([[mass + rotor, jacobian.T], [jacobian, np.zeros((c, c))]])
-        solution = np.linalg.lstsq(
-            system, np.concatenate([rows.T @ torque - bias, -change]), rcond=1e-13
-        )[0]
+        stacked_bias = np.concatenate([rows.T @ torque - bias, -change])
+        solution = np.linalg.lstsq(system, stacked_bias, rcond=1e-13)[0]
         return solution[: self.n], torque @ rows - rotor @ solution[: self.n]
 
 
@@ -151,14 +155,18 @@ def test_accelerations_are_those_of_a_solution_with_multipliers(name: str, paylo
         # The speed of a step is closed where the step began, J_c(q − h v) v = 0, so that J_c(q) v =
         # h J̇_c v at its end.
         change = reference.rows(q, v)[1]
-        v += step_s * np.linalg.pinv(jacobian, rcond=1e-10) @ change
+        jacobian_inverse = np.linalg.pinv(jacobian, rcond=1e-10)
+        v += step_s * jacobian_inverse @ change
         current = rng.normal(0.0, 2.0, len(spec.axes))
-        expected, load = reference.accelerations(q, v, plant._gain * current, change)
+        torque = plant._gain * current
+        expected, load = reference.accelerations(q, v, torque, change)
         plant.velocity_rad_s[:] = v
         plant.step(current)
         found = (plant.velocity_rad_s - v) / step_s
-        np.testing.assert_allclose(found, expected, atol=1e-8 * np.abs(expected).max())
-        np.testing.assert_allclose(plant.load_torque_nm, load, atol=1e-7 * np.abs(load).max())
+        largest_absolute_expected = np.abs(expected).max()
+        np.testing.assert_allclose(found, expected, atol=1e-8 * largest_absolute_expected)
+        largest_absolute_load = np.abs(load).max()
+        np.testing.assert_allclose(plant.load_torque_nm, load, atol=1e-7 * largest_absolute_load)
 
 
 @pytest.mark.parametrize("name", ROBOTS)
@@ -167,10 +175,12 @@ def test_accelerations_from_rest_are_those_of_pinocchio(name: str) -> None:
     its proximal iterations taking the redundant rows.
     """
     spec = frictionless(cell(name))
-    spec = replace(spec, axes=tuple(replace(a, motor_inertia_kg_m2=0.0) for a in spec.axes))
+    axes = tuple(replace(a, motor_inertia_kg_m2=0.0) for a in spec.axes)
+    spec = replace(spec, axes=axes)
     plant = released(spec)
     assert plant.mechanism is not None
-    posed(plant, np.random.default_rng(4))
+    rng = np.random.default_rng(4)
+    posed(plant, rng)
     order = plant.mechanism.order
     n = len(plant.position_rad)
     model = link_model(spec)
@@ -188,17 +198,16 @@ def test_accelerations_from_rest_are_those_of_pinocchio(name: str) -> None:
             points.append(0.1 * np.array([f"r{axis}" not in closure.directions for axis in "xyz"]))
         for point in points:
             at = pin.SE3(np.eye(3), point)
-            constraints.append(
-                pin.RigidConstraintModel(
-                    pin.ContactType.CONTACT_3D,
-                    model,
-                    first.parentJoint,
-                    first.placement * at,
-                    second.parentJoint,
-                    second.placement * at,
-                    pin.ReferenceFrame.LOCAL,
-                )
+            rigid_constraint_model = pin.RigidConstraintModel(
+                pin.ContactType.CONTACT_3D,
+                model,
+                first.parentJoint,
+                first.placement * at,
+                second.parentJoint,
+                second.placement * at,
+                pin.ReferenceFrame.LOCAL,
             )
+            constraints.append(rigid_constraint_model)
     current = np.random.default_rng(5).normal(0.0, 1.0, len(spec.axes))
     torque = np.zeros(n)
     q = np.zeros(n)
@@ -214,7 +223,8 @@ def test_accelerations_from_rest_are_those_of_pinocchio(name: str) -> None:
     )[order]
     plant.step(current)
     found = plant.velocity_rad_s / plant._mechanics.step_s
-    np.testing.assert_allclose(found, expected, atol=1e-8 * np.abs(expected).max())
+    largest_absolute_expected = np.abs(expected).max()
+    np.testing.assert_allclose(found, expected, atol=1e-8 * largest_absolute_expected)
 
 
 def slides_of(place_m: FloatArray) -> FloatArray:
@@ -231,28 +241,31 @@ def test_an_orthoglide_moves_as_it_should_and_turns_nothing() -> None:
     spec = cell("orthoglide")
     plant = Plant(spec)
     assert plant.mechanism is not None
-    model = link_model(replace(spec, payload=None))
+    changed_spec = replace(spec, payload=None)
+    model = link_model(changed_spec)
     data = model.createData()
     frame = model.getFrameId("plate-centre", pin.FrameType.BODY)
-    for place_m in np.random.default_rng(6).uniform(-0.04, 0.1, (5, 3)):
+    rng = np.random.default_rng(6)
+    for place_m in rng.uniform(-0.04, 0.1, (5, 3)):
         position = plant.mechanism.start_rad
         for share in np.linspace(0.1, 1.0, 10):
-            position = plant.mechanism.closed(
-                np.concatenate([slides_of(share * place_m), position[3:]]), (3,)
-            )
+            slides = slides_of(share * place_m)
+            stacked_slides = np.concatenate([slides, position[3:]])
+            position = plant.mechanism.closed(stacked_slides, (3,))
         sorted_position = np.empty(len(position))
         sorted_position[plant.mechanism.order] = position
         pin.framesForwardKinematics(model, data, sorted_position)
-        np.testing.assert_allclose(data.oMf[frame].translation, place_m, atol=1e-10)
-        np.testing.assert_allclose(data.oMf[frame].rotation, np.eye(3), atol=1e-10)
+        translation = data.oMf[frame].translation
+        np.testing.assert_allclose(translation, place_m, atol=1e-10)
+        rotation = data.oMf[frame].rotation
+        np.testing.assert_allclose(rotation, np.eye(3), atol=1e-10)
 
 
 def test_the_rods_of_the_orthoglide_follow_from_its_design_rule() -> None:
     """Transmission factors of 0.5 to 2 in a cube of 200 mm (Chablat and Wenger 2003)."""
     factors = []
-    for corner in np.stack(np.meshgrid(*[np.linspace(-0.073, 0.127, 5)] * 3), axis=-1).reshape(
-        -1, 3
-    ):
+    grid = np.linspace(-0.073, 0.127, 5)
+    for corner in np.stack(np.meshgrid(*[grid] * 3), axis=-1).reshape(-1, 3):
         columns = [
             (slides_of(corner + 1e-6 * e) - slides_of(corner - 1e-6 * e)) / 2e-6 for e in np.eye(3)
         ]
@@ -268,7 +281,8 @@ def test_a_five_bar_follows_its_lagrangian() -> None:
     spec = frictionless(cell("five-bar"))
     plant = released(spec)
     rng = np.random.default_rng(8)
-    model = link_model(replace(spec, payload=None))
+    changed_spec = replace(spec, payload=None)
+    model = link_model(changed_spec)
     bodies = {name: model.inertias[model.getJointId(name)] for name in model.names[1:]}
     crank_m = 0.25
     rod_m = 0.45
@@ -282,7 +296,8 @@ def test_a_five_bar_follows_its_lagrangian() -> None:
     for _ in range(5):
         posed(plant, rng)
         x = dict(zip(("crank-1", "crank-2", "elbow-1", "elbow-2"), plant.position_rad, strict=True))
-        angle = np.array([x[f"crank-{k}"] + zero[f"crank-{k}"] for k in (1, 2)])
+        zeros = [x[f"crank-{k}"] + zero[f"crank-{k}"] for k in (1, 2)]
+        angle = np.array(zeros)
         rod = angle + [x[f"elbow-{k}"] + zero[f"elbow-{k}"] for k in (1, 2)]
         # Coordinates y = (θ₁, θ₂, ϕ₁, ϕ₂); closure A₁ + l₁ e(θ₁) + l₂ e(ϕ₁) = A₂ + l₁ e(θ₂) + l₂
         # e(ϕ₂).
@@ -296,7 +311,8 @@ def test_a_five_bar_follows_its_lagrangian() -> None:
         curve = -(np.array([np.cos(angle), np.sin(angle)]) * crank_m * [1, -1]) @ rates[:2] ** 2
         curve -= (np.array([np.cos(rod), np.sin(rod)]) * rod_m * [1, -1]) @ rates[2:] ** 2
         closure[:, :2], closure[:, 2:] = across, across_rod
-        rates += step_s * np.linalg.pinv(closure) @ curve  # as in the test above
+        closure_inverse = np.linalg.pinv(closure)
+        rates += step_s * closure_inverse @ curve  # as in the test above
         for k in (0, 1):
             crank = bodies[f"crank-{k + 1}"]
             link = bodies[f"elbow-{k + 1}"]
@@ -305,7 +321,8 @@ def test_a_five_bar_follows_its_lagrangian() -> None:
             mass[k, k] = crank.inertia[2, 2] + crank.mass * c @ c + link.mass * crank_m**2
             mass[k, k] += spec.axes[k].motor_inertia_kg_m2
             mass[2 + k, 2 + k] = link.inertia[2, 2] + link.mass * r @ r
-            along = np.cos(rod[k] - angle[k])
+            rod_difference = rod[k] - angle[k]
+            along = np.cos(rod_difference)
             beside = np.sin(rod[k] - angle[k])
             mass[k, 2 + k] = mass[2 + k, k] = link.mass * crank_m * (r[0] * along - r[1] * beside)
             push = link.mass * crank_m * (r[0] * beside + r[1] * along)
@@ -318,17 +335,20 @@ def test_a_five_bar_follows_its_lagrangian() -> None:
         current = rng.normal(0.0, 1.0, 2)
         torque = np.concatenate([motor_rows(spec.ratio).T @ (plant._gain * current), np.zeros(2)])
         system = np.block([[mass, closure.T], [closure, np.zeros((2, 2))]])
-        expected = np.linalg.solve(
-            system, np.concatenate([torque - bias, -closure @ rates / step_s])
-        )[:4]
-        before = np.concatenate([rates[:2], rates[2:] - rates[:2]])
+        stacked_torque = np.concatenate([torque - bias, -closure @ rates / step_s])
+        expected = np.linalg.solve(system, stacked_torque)[:4]
+        rate_difference = rates[2:] - rates[:2]
+        before = np.concatenate([rates[:2], rate_difference])
         plant.velocity_rad_s[:] = before
         plant.step(current)
         found = (plant.velocity_rad_s - before) / step_s
+        expected_difference = expected[2:] - expected[:2]
+        stacked_expected = np.concatenate([expected[:2], expected_difference])
+        largest_absolute_expected = np.abs(expected).max()
         np.testing.assert_allclose(
             found,
-            np.concatenate([expected[:2], expected[2:] - expected[:2]]),
-            atol=1e-7 * np.abs(expected).max(),
+            stacked_expected,
+            atol=1e-7 * largest_absolute_expected,
         )
 
 
@@ -337,7 +357,8 @@ def test_energy_drift_vanishes_with_the_step(name: str) -> None:
     def drift(substeps: int) -> float:
         spec = replace(frictionless(cell(name)), substeps=substeps)
         plant = released(spec)
-        posed(plant, np.random.default_rng(7))
+        rng = np.random.default_rng(7)
+        posed(plant, rng)
         reference = Constrained(spec, plant)
         rotor = np.array([a.motor_inertia_kg_m2 for a in spec.axes])
 
@@ -351,8 +372,10 @@ def test_energy_drift_vanishes_with_the_step(name: str) -> None:
             )
             return float(kinetic + pin.computePotentialEnergy(reference.model, reference.data, q))
 
-        kick = 3.0 * plant._basis @ np.linspace(0.4, 0.8, plant._basis.shape[1])
-        plant.velocity_rad_s[:] = kick / np.abs(kick).max()
+        grid = np.linspace(0.4, 0.8, plant._basis.shape[1])
+        kick = 3.0 * plant._basis @ grid
+        largest_absolute_kick = np.abs(kick).max()
+        plant.velocity_rad_s[:] = kick / largest_absolute_kick
         start = energy()
         for _ in range(40 * substeps):
             plant.step(np.zeros(len(spec.axes)))
@@ -370,29 +393,31 @@ def test_closures_hold_in_a_long_run_and_friction_only_takes_energy(name: str) -
     plant = released(spec)
     assert plant.mechanism is not None
     n = len(spec.axes)
-    stiffness = 60.0 * np.abs(plant.motor_inertia_at(plant.position_rad))
+    motor_inertia = plant.motor_inertia_at(plant.position_rad)
+    stiffness = 60.0 * np.abs(motor_inertia)
     worst = 0.0
     for k in range(4000):
         place = 0.12 * np.sin(2 * np.pi * 1.1 * k * plant._mechanics.step_s + np.arange(n))
         place *= 0.3 if name == "orthoglide" else 1.0
-        pull = (
-            stiffness * (place - plant.position_rad[:n])
-            - 0.1 * stiffness * plant.velocity_rad_s[:n]
-        )
+        place_difference = place - plant.position_rad[:n]
+        pull = stiffness * place_difference - 0.1 * stiffness * plant.velocity_rad_s[:n]
         plant.step(np.linalg.solve(motor_rows(spec.ratio).T, pull) / plant._gain)
         rubbing = plant._mechanics.directions.T @ plant._impulse
         assert rubbing @ plant.velocity_rad_s <= 1e-9
         if k % 20 == 0:
             worst = max(worst, float(np.abs(plant.mechanism.at(plant.position_rad)[0]).max()))
     assert worst < 1e-11
-    assert np.abs(plant.position_rad - plant.mechanism.start_rad).max() > 0.01
-    np.testing.assert_allclose(plant.motor_rad, spec.ratio @ plant.position_rad[:n], rtol=1e-12)
+    position_difference_rad = plant.position_rad - plant.mechanism.start_rad
+    assert np.abs(position_difference_rad).max() > 0.01
+    expected = spec.ratio @ plant.position_rad[:n]
+    np.testing.assert_allclose(plant.motor_rad, expected, rtol=1e-12)
 
 
 @pytest.mark.parametrize("name", ROBOTS)
 def test_a_mechanism_loaded_below_its_friction_stays_exactly_where_it_is(name: str) -> None:
     spec = replace(cell(name), gravity_m_s2=(0.0, 0.0, 0.0))
-    spec = replace(spec, axes=tuple(replace(a, offset_nm=0.0) for a in spec.axes))
+    axes = tuple(replace(a, offset_nm=0.0) for a in spec.axes)
+    spec = replace(spec, axes=axes)
     plant = released(spec)
     start = plant.position_rad.copy()
     below = np.array([0.9 * a.coulomb_nm / abs(a.gain_nm_per_a) for a in spec.axes])
@@ -402,7 +427,8 @@ def test_a_mechanism_loaded_below_its_friction_stays_exactly_where_it_is(name: s
     assert (plant.position_rad == start).all()
     for _ in range(40):
         plant.step(4.0 * below)
-    assert np.abs(plant.velocity_rad_s).min() > 0.0
+    absolute_velocity_rad_s = np.abs(plant.velocity_rad_s)
+    assert absolute_velocity_rad_s.min() > 0.0
 
 
 @pytest.mark.parametrize("name", ROBOTS)
@@ -422,25 +448,31 @@ def test_a_braked_motor_stays_while_the_others_move(name: str) -> None:
     plant.set_brakes(closed)
     for _ in range(100):
         plant.step(np.full(len(spec.axes), 1.5))
-    assert plant.position_rad[0] == Plant(spec).position_rad[0]
-    assert np.abs(plant.velocity_rad_s[1 : len(spec.axes)]).min() > 0.01
+    expected = Plant(spec).position_rad[0]
+    assert plant.position_rad[0] == expected
+    absolute_velocity_rad_s = np.abs(plant.velocity_rad_s[1 : len(spec.axes)])
+    assert absolute_velocity_rad_s.min() > 0.01
 
 
 def test_an_effect_acts_on_a_passive_joint() -> None:
     spec = cell("five-bar")
-    spring = UndeclaredEffect(
-        "spring", -1, {"stiffness_nm_per_rad": 5.0, "rest_rad": 1.0}, joint="elbow-2"
-    )
+    parameters = {"stiffness_nm_per_rad": 5.0, "rest_rad": 1.0}
+    spring = UndeclaredEffect("spring", -1, parameters, joint="elbow-2")
     plain = released(frictionless(spec))
-    sprung = released(frictionless(replace(spec, effects=(spring,))))
+    changed_spec = replace(spec, effects=(spring,))
+    sprung = released(frictionless(changed_spec))
     plain.step(np.zeros(2))
     sprung.step(np.zeros(2))
-    change = (sprung.velocity_rad_s - plain.velocity_rad_s) / plain._mechanics.step_s
+    velocity_difference_rad_s = sprung.velocity_rad_s - plain.velocity_rad_s
+    change = velocity_difference_rad_s / plain._mechanics.step_s
     assert change @ np.array([0, 0, 0, 5.0]) > 0.0  # it works with the joint that it turns
+    undeclared_effect = UndeclaredEffect("cogging", -1, {}, joint="elbow-2")
+    effects = (undeclared_effect,)
     with pytest.raises(SpecInvalid, match="no motor"):
-        Plant(replace(spec, effects=(UndeclaredEffect("cogging", -1, {}, joint="elbow-2"),)))
+        Plant(replace(spec, effects=effects))
+    changed_spring = replace(spring, joint="knee")
     with pytest.raises(SpecInvalid, match="elbow-1, elbow-2"):
-        Plant(replace(spec, effects=(replace(spring, joint="knee"),)))
+        Plant(replace(spec, effects=(changed_spring,)))
 
 
 def test_a_serial_plant_takes_the_same_step_as_before() -> None:
@@ -459,13 +491,18 @@ def test_a_serial_plant_takes_the_same_step_as_before() -> None:
     for k in range(300):
         current = 1.5 * np.sin(0.01 * k * np.arange(1.0, 7.0))
         plant.step(current)
+        mass = np.ascontiguousarray(pin.crba(model, data, position))
+        bias = pin.nonLinearEffects(model, data, position, velocity)
+        motor_torque = other._gain * current
+        viscous = other._viscous.copy()
+        torque = other._torque.copy()
         advance(
             other._constants,
-            np.ascontiguousarray(pin.crba(model, data, position)),
-            pin.nonLinearEffects(model, data, position, velocity),
-            other._viscous.copy(),
-            other._gain * current,
-            other._torque.copy(),
+            mass,
+            bias,
+            viscous,
+            motor_torque,
+            torque,
             bound,
             impulse,
             position,
@@ -486,26 +523,29 @@ def test_what_does_not_close_or_move_is_refused() -> None:
     far = spec.urdf.replace('<origin xyz="-0.15 0 0"', '<origin xyz="-2 0 0"')
     with pytest.raises(SpecInvalid, match="tip stays open"):
         Plant(replace(spec, urdf=far))
+    welded = replace(tip, directions=("x", "y", "rz"))
+    closures = (welded,)
     with pytest.raises(SpecInvalid, match=r"tip stays open|1 degrees of freedom"):
-        Plant(replace(spec, closures=(replace(tip, directions=("x", "y", "rz")),)))
+        Plant(replace(spec, closures=closures))
+    changed_tip = replace(tip, second="knee")
+    changed_spec = replace(spec, closures=(changed_tip,))
     with pytest.raises(SpecInvalid, match="no link knee; expected one of"):
-        Plant(replace(spec, closures=(replace(tip, second="knee"),)))
+        Plant(changed_spec)
     with pytest.raises(SpecInvalid, match="motors: the URDF has no joint hip"):
         Plant(replace(spec, motors=("crank-1", "hip")))
+    assembly_rad = {k: v for k, v in spec.assembly_rad.items() if k != "elbow-2"}
     with pytest.raises(SpecInvalid, match="no position of elbow-2"):
-        Plant(
-            replace(
-                spec, assembly_rad={k: v for k, v in spec.assembly_rad.items() if k != "elbow-2"}
-            )
-        )
+        Plant(replace(spec, assembly_rad=assembly_rad))
+    ratio = np.eye(1)
+    start_rad = np.zeros(1)
     with pytest.raises(SpecInvalid, match="2 degrees of freedom"):
         Plant(
             replace(
                 spec,
                 motors=spec.motors[:1],
                 axes=spec.axes[:1],
-                ratio=np.eye(1),
-                start_rad=np.zeros(1),
+                ratio=ratio,
+                start_rad=start_rad,
             )
         )
     with pytest.raises(SpecInvalid, match="start of crank-"):
@@ -516,15 +556,11 @@ def test_what_does_not_close_or_move_is_refused() -> None:
 def test_motors_that_do_not_actuate_are_refused() -> None:
     spec = cell("orthoglide")
     # Both move the same leg.
+    motors = ("slide-x", "rod-a-x", "coupler-x")
+    start_rad = np.zeros(3)
+    changed_spec = replace(spec, motors=motors, passive={}, start_rad=start_rad)
     with pytest.raises(SpecInvalid, match="move 2 of 3 degrees of freedom"):
-        Plant(
-            replace(
-                spec,
-                motors=("slide-x", "rod-a-x", "coupler-x"),
-                passive={},
-                start_rad=np.zeros(3),
-            )
-        )
+        Plant(changed_spec)
 
 
 def test_closures_that_cannot_be_met_are_reported() -> None:
@@ -542,9 +578,8 @@ def test_a_closure_of_two_rotations_leaves_the_third_free() -> None:
     <axis xyz="0 0 1"/><limit lower="-3" upper="3" velocity="3" effort="9"/></joint>
     <link name="door"><inertial><mass value="2"/>
     <inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial></link></robot>"""  # noqa: E501
-    axis = replace(
-        cell("five-bar").axes[0], motor_inertia_kg_m2=0.5, viscous_nm_s_rad=0.0, coulomb_nm=0.0
-    )
+    axes = cell("five-bar").axes
+    axis = replace(axes[0], motor_inertia_kg_m2=0.5, viscous_nm_s_rad=0.0, coulomb_nm=0.0)
     spec = replace(
         cell("five-bar"),
         urdf=urdf,

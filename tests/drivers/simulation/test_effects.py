@@ -35,7 +35,8 @@ def extra_torque_nm(
     after = []
     for effects in ((), (effect,)):
         plant = Plant(clean_cell(effects=effects))
-        plant.set_brakes(np.zeros(6, dtype=np.bool_))
+        closed = np.zeros(6, dtype=np.bool_)
+        plant.set_brakes(closed)
         plant.position_rad[:] = posture
         plant.velocity_rad_s[:] = speed
         plant.motor_rad[:] = clean_cell().ratio @ posture
@@ -45,15 +46,18 @@ def extra_torque_nm(
         after.append(plant.velocity_rad_s.copy())
     spec = clean_cell()
     rows = motor_rows(spec.ratio)
-    model = link_model(replace(spec, payload=None))
-    viscous = np.diag([axis.viscous_nm_s_rad for axis in spec.axes])
+    changed_spec = replace(spec, payload=None)
+    model = link_model(changed_spec)
+    viscous_nm_s_rad = [axis.viscous_nm_s_rad for axis in spec.axes]
+    viscous = np.diag(viscous_nm_s_rad)
     motor = [axis.motor_inertia_kg_m2 + STEP_S * axis.motor_viscous_nm_s_rad for axis in spec.axes]
     inertia = (
         pin.crba(model, model.createData(), posture)
         + rows.T @ np.diag(motor) @ rows
         + STEP_S * viscous
     )
-    return np.asarray(inertia @ (after[1] - after[0]) / STEP_S)
+    after_difference = after[1] - after[0]
+    return np.asarray(inertia @ after_difference / STEP_S)
 
 
 def only(axis: int, value: float) -> FloatArray:
@@ -67,15 +71,15 @@ def test_odd_friction_opposes_the_motion_with_its_law(axis: int, direction: floa
     speed = direction * SPEED
     v = abs(SPEED[axis])
     s = np.sign(speed[axis])
+    parameters = {"torque_at_1_rad_s_nm": 1.5, "exponent": 1 / 3}
+    undeclared_effect = UndeclaredEffect("nonlinear-viscous", axis, parameters)
     cases = (
         (
             UndeclaredEffect("stribeck", axis, {"rise_nm": 2.0, "speed_rad_s": 0.3}),
             2.0 * math.exp(-v / 0.3),
         ),
         (
-            UndeclaredEffect(
-                "nonlinear-viscous", axis, {"torque_at_1_rad_s_nm": 1.5, "exponent": 1 / 3}
-            ),
+            undeclared_effect,
             1.5 * v ** (1 / 3),
         ),
         (
@@ -93,7 +97,9 @@ def test_odd_friction_opposes_the_motion_with_its_law(axis: int, direction: floa
 def test_load_friction_is_proportional_to_the_size_of_the_load(load_nm: float) -> None:
     effect = UndeclaredEffect("load-friction", 2, {"coefficient": 0.12})
     extra = extra_torque_nm(effect, load_nm=load_nm)
-    np.testing.assert_allclose(extra, only(2, -0.12 * abs(load_nm) * np.sign(SPEED[2])), atol=1e-6)
+    speed_sign = np.sign(SPEED[2])
+    expected = only(2, -0.12 * abs(load_nm) * speed_sign)
+    np.testing.assert_allclose(extra, expected, atol=1e-6)
 
 
 @pytest.mark.parametrize("load_nm", [-40.0, -3.0, 0.0, 25.0])
@@ -101,30 +107,34 @@ def test_a_gear_passes_a_part_of_the_power_whichever_side_drives(load_nm: float)
     """Power into the gear times η is the power out of it, friction of the joint included."""
     axis = clean_cell().axes[2]
     eta = 0.8
-    friction = np.sign(SPEED[2]) * axis.coulomb_nm + axis.viscous_nm_s_rad * SPEED[2]
+    speed_sign = np.sign(SPEED[2])
+    friction = speed_sign * axis.coulomb_nm + axis.viscous_nm_s_rad * SPEED[2]
     out = load_nm + friction
-    lost = -extra_torque_nm(UndeclaredEffect("efficiency", 2, {"efficiency": eta}), load_nm=load_nm)
+    effect = UndeclaredEffect("efficiency", 2, {"efficiency": eta})
+    lost = -extra_torque_nm(effect, load_nm=load_nm)
     into = out + lost[2]
     power_in = into * SPEED[2]
     power_out = out * SPEED[2]
     assert (power_out if power_in > 0.0 else power_in) == pytest.approx(
         eta * (power_in if power_in > 0.0 else power_out), abs=1e-6
     )
-    np.testing.assert_allclose(lost, only(2, lost[2]), atol=1e-6)
+    expected = only(2, lost[2])
+    np.testing.assert_allclose(lost, expected, atol=1e-6)
 
 
 def test_load_friction_knows_the_payload() -> None:
     torque = {}
     for payload in (None, "disc"):
-        plant = Plant(
-            clean_cell(payload, (UndeclaredEffect("load-friction", 1, {"coefficient": 0.1}),))
-        )
+        effects = (UndeclaredEffect("load-friction", 1, {"coefficient": 0.1}),)
+        plant = Plant(clean_cell(payload, effects))
         plant.step(np.zeros(6))
         model = link_model(clean_cell(payload))
         weight = pin.computeGeneralizedGravity(model, model.createData(), clean_cell().start_rad)
         np.testing.assert_allclose(plant.load_torque_nm, weight, atol=1e-9)
         torque[payload] = plant.load_torque_nm[1]
-    assert abs(torque["disc"]) > abs(torque[None]) + 10.0
+    absolute_disc = abs(torque["disc"])
+    absolute_torque = abs(torque[None])
+    assert absolute_disc > absolute_torque + 10.0
 
 
 def test_asymmetric_viscous_is_even_in_speed() -> None:
@@ -132,12 +142,15 @@ def test_asymmetric_viscous_is_even_in_speed() -> None:
     forwards = extra_torque_nm(effect, -SPEED)
     backwards = extra_torque_nm(effect, SPEED)
     # Implicit in the step, so it acts on the speed at its end.
-    np.testing.assert_allclose(forwards, only(1, -0.8 * abs(SPEED[1])), atol=0.05)
+    absolute_speed = abs(SPEED[1])
+    expected = only(1, -0.8 * absolute_speed)
+    np.testing.assert_allclose(forwards, expected, atol=0.05)
     np.testing.assert_allclose(backwards, forwards, atol=0.05)
 
 
 def test_spring_depends_on_position_alone() -> None:
-    effect = UndeclaredEffect("spring", 1, {"stiffness_nm_per_rad": 30.0, "rest_rad": 0.2})
+    parameters = {"stiffness_nm_per_rad": 30.0, "rest_rad": 0.2}
+    effect = UndeclaredEffect("spring", 1, parameters)
     for speed in (SPEED, -SPEED):
         np.testing.assert_allclose(
             extra_torque_nm(effect, speed), only(1, -30.0 * (POSTURE[1] - 0.2)), atol=1e-6
@@ -170,7 +183,8 @@ def test_a_clipped_current_gives_no_more_than_its_limit() -> None:
     effect = UndeclaredEffect("clipped-current", 0, {"limit_a": 2.0})
     gain = clean_cell().axes[0].gain_nm_per_a
     for current in (-5.0, -1.0, 2.0, 3.0):
-        given_a = min(max(current, -2.0), 2.0)
+        largest_current = max(current, -2.0)
+        given_a = min(largest_current, 2.0)
         lost = gain * (current - given_a)
         np.testing.assert_allclose(
             extra_torque_nm(effect, current=only(0, current)), only(0, -lost), atol=1e-6
@@ -178,7 +192,8 @@ def test_a_clipped_current_gives_no_more_than_its_limit() -> None:
 
 
 def test_an_offset_that_drifts_fades_with_time() -> None:
-    effect = UndeclaredEffect("offset-drift", 1, {"offset_nm": 3.0, "time_constant_s": 50.0})
+    parameters = {"offset_nm": 3.0, "time_constant_s": 50.0}
+    effect = UndeclaredEffect("offset-drift", 1, parameters)
     np.testing.assert_allclose(extra_torque_nm(effect), only(1, -3.0), atol=1e-6)
     np.testing.assert_allclose(
         extra_torque_nm(effect, time_s=100.0), only(1, -3.0 * math.exp(-2.0)), atol=1e-6
@@ -205,11 +220,16 @@ def test_a_counterbalance_gives_the_work_of_its_force(angle: float) -> None:
     effect = UndeclaredEffect("counterbalance", 1, {**parameters, "preload_n": preload})
 
     def energy(q: float) -> float:
-        lever = lever_m * np.array([math.cos(q - phase_rad), math.sin(q - phase_rad)])
-        longer_m = float(np.linalg.norm(lever - [base_m, 0.0])) - (base_m - lever_m)
+        difference_cosine = math.cos(q - phase_rad)
+        difference_sine = math.sin(q - phase_rad)
+        lever = lever_m * np.array([difference_cosine, difference_sine])
+        lever_difference = lever - [base_m, 0.0]
+        lever_difference_norm = np.linalg.norm(lever_difference)
+        longer_m = float(lever_difference_norm) - (base_m - lever_m)
         return preload * longer_m + 0.5 * stiffness * longer_m**2
 
-    expected = -(energy(angle + 1e-5) - energy(angle - 1e-5)) / 2e-5
+    difference = energy(angle + 1e-5) - energy(angle - 1e-5)
+    expected = -difference / 2e-5
     posture = np.where(np.arange(6) == 1, angle, POSTURE)
     np.testing.assert_allclose(
         extra_torque_nm(effect, posture=posture), only(1, expected), atol=1e-4
@@ -217,15 +237,19 @@ def test_a_counterbalance_gives_the_work_of_its_force(angle: float) -> None:
 
 
 def test_position_friction_follows_the_joint_angle_and_the_sign_of_speed() -> None:
-    effect = UndeclaredEffect("position-friction", 2, {"amplitude_nm": 2.0, "phase_rad": 0.4})
+    parameters = {"amplitude_nm": 2.0, "phase_rad": 0.4}
+    effect = UndeclaredEffect("position-friction", 2, parameters)
     for turn in (0.0, 1.0, 2.5):
         posture = POSTURE + only(2, turn)
-        expected = only(2, -2.0 * math.cos(posture[2] - 0.4) * np.sign(SPEED[2]))
+        posture_cosine = math.cos(posture[2] - 0.4)
+        speed_sign = np.sign(SPEED[2])
+        expected = only(2, -2.0 * posture_cosine * speed_sign)
         np.testing.assert_allclose(extra_torque_nm(effect, posture=posture), expected, atol=1e-6)
 
 
 def test_cogging_repeats_with_the_motor_and_acts_along_its_gear() -> None:
-    effect = UndeclaredEffect("cogging", 5, {"amplitude_nm": 0.7, "order": 4.0})
+    parameters = {"amplitude_nm": 0.7, "order": 4.0}
+    effect = UndeclaredEffect("cogging", 5, parameters)
     ratio = clean_cell().ratio
     for turn in (0.0, 0.01, 2 * np.pi / (4 * 32)):
         posture = POSTURE + only(5, turn)
@@ -241,11 +265,13 @@ def test_saturation_takes_a_cubic_share_of_the_torque() -> None:
     for current in (-3.0, -0.3, 0.3, 3.0, 6.0):
         extra = extra_torque_nm(effect, current=only(0, current))
         lost = gain * current * (1 - 1 / (1 + (current / 6.0) ** 2))
-        np.testing.assert_allclose(extra, only(0, -lost), atol=1e-6)
+        expected = only(0, -lost)
+        np.testing.assert_allclose(extra, expected, atol=1e-6)
 
 
 def test_warm_up_fades_with_time() -> None:
-    effect = UndeclaredEffect("warm-up", 0, {"cold_fraction": 0.5, "time_constant_s": 100.0})
+    parameters = {"cold_fraction": 0.5, "time_constant_s": 100.0}
+    effect = UndeclaredEffect("warm-up", 0, parameters)
     cold = extra_torque_nm(effect)[0]
     later = extra_torque_nm(effect, time_s=100.0)[0]
     axis = clean_cell().axes[0]
@@ -262,16 +288,17 @@ HEATED = {
 
 def test_losses_heat_a_drive_to_their_balance_and_its_friction_follows() -> None:
     """Dry 5 Nm and viscous 10 Nm s/rad at 0.8 rad/s, and 2 Ω at 3 A, for 10 s and then for ever."""
-    effect = build_effect(
-        UndeclaredEffect("temperature-friction", 0, HEATED | {"winding_ohm": 2.0}), 1
-    )
+    parameters = HEATED | {"winding_ohm": 2.0}
+    undeclared_effect = UndeclaredEffect("temperature-friction", 0, parameters)
+    effect = build_effect(undeclared_effect, 1)
     assert not isinstance(effect, Lag)
     moment = Moment(0.0, 0.1, *(np.zeros(1) for _ in range(10)))
     moment.temperature_c[0], moment.velocity_rad_s[0], moment.current_a[0] = 25.0, -0.8, 3.0
     above_k = 0.0
     for step in range(1000):
         moment.bound_nm[0], moment.viscous_nm_s_rad[0] = 5.0, 10.0
-        warm_k = float(moment.temperature_c[0]) - 25.0
+        temperature_c = float(moment.temperature_c[0])
+        warm_k = temperature_c - 25.0
         effect(moment)
         assert moment.bound_nm[0] == pytest.approx(5.0 * (1.0 + 0.005 * warm_k))
         assert moment.viscous_nm_s_rad[0] == pytest.approx(10.0 * (1.0 - 0.02 * warm_k))
@@ -290,13 +317,16 @@ def test_losses_heat_a_drive_to_their_balance_and_its_friction_follows() -> None
 
 def test_a_plant_without_that_effect_stays_at_the_temperature_of_its_surroundings() -> None:
     heated = UndeclaredEffect("temperature-friction", 1, HEATED)
-    plant = Plant(clean_cell(effects=(heated,)))
-    plant.set_brakes(np.zeros(6, dtype=np.bool_))
+    spec = clean_cell(effects=(heated,))
+    plant = Plant(spec)
+    closed = np.zeros(6, dtype=np.bool_)
+    plant.set_brakes(closed)
     plant.velocity_rad_s[:] = SPEED
     for _ in range(20):
         plant.step(np.zeros(6))
     assert plant.temperature_c[1] > 25.0
-    assert plant.temperature_c[[0, 2, 3, 4, 5]].tolist() == [25.0] * 5
+    temperature_c = plant.temperature_c[[0, 2, 3, 4, 5]].tolist()
+    assert temperature_c == [25.0] * 5
 
 
 def test_presliding_builds_up_over_its_distance_after_a_reversal() -> None:
@@ -318,9 +348,8 @@ def test_presliding_builds_up_over_its_distance_after_a_reversal() -> None:
 
 
 def test_coupling_rubs_on_the_sum_of_two_joints() -> None:
-    effect = UndeclaredEffect(
-        "coupling", 3, {"other_axis": 5, "coulomb_nm": 0.4, "viscous_nm_s_rad": 0.3}
-    )
+    parameters = {"other_axis": 5, "coulomb_nm": 0.4, "viscous_nm_s_rad": 0.3}
+    effect = UndeclaredEffect("coupling", 3, parameters)
     same = SPEED.copy()
     same[3:5] = [0.5, 0.9]
     size = -(0.4 + 0.3 * 1.4)
@@ -341,19 +370,22 @@ def held_twist_rad(effect: UndeclaredEffect, current_a: float) -> float:
     """
     spec = clean_cell(effects=(effect,))
     # A joint that does not move under this current: the twist is the drive's alone.
-    axes = (replace(spec.axes[0], coulomb_nm=500.0, offset_nm=0.0), *spec.axes[1:])
-    plant = Plant(replace(spec, axes=axes))
-    plant.set_brakes(np.array([False, True, True, True, True, True]))
+    changed_axis = replace(spec.axes[0], coulomb_nm=500.0, offset_nm=0.0)
+    axes = (changed_axis, *spec.axes[1:])
+    changed_spec = replace(spec, axes=axes)
+    plant = Plant(changed_spec)
+    closed = np.array([False, True, True, True, True, True])
+    plant.set_brakes(closed)
     for _ in range(4000):
         plant.step(only(0, current_a))
     assert plant.position_rad[0] == spec.start_rad[0]
-    return float(plant.position_rad[6] - plant.position_rad[0])
+    position_difference_rad = plant.position_rad[6] - plant.position_rad[0]
+    return float(position_difference_rad)
 
 
 def test_an_elastic_drive_twists_by_torque_over_stiffness() -> None:
-    effect = UndeclaredEffect(
-        "elasticity", 0, {"stiffness_nm_per_rad": 8000.0, "damping_nm_s_per_rad": 60.0}
-    )
+    parameters = {"stiffness_nm_per_rad": 8000.0, "damping_nm_s_per_rad": 60.0}
+    effect = UndeclaredEffect("elasticity", 0, parameters)
     gain = clean_cell().axes[0].gain_nm_per_a
     for current in (-1.0, 2.0):
         assert held_twist_rad(effect, current) == pytest.approx(gain * current / 8000.0, rel=1e-6)
@@ -400,25 +432,29 @@ def test_bounds_of_dry_friction_never_become_negative(
         moment.bound_nm[0], moment.load_torque_nm[0] = 1.0, load
         moment.velocity_rad_s[0], moment.position_rad[0] = speed, angle
         moment.temperature_c[0] = 25.0 + load * load
-        effect = build_effect(UndeclaredEffect(name, 0, parameters), 1)
+        undeclared_effect = UndeclaredEffect(name, 0, parameters)
+        effect = build_effect(undeclared_effect, 1)
         assert not isinstance(effect, Lag)
         effect(moment)
         assert moment.bound_nm[0] >= 0.0
 
 
 def test_unknown_names_and_parameters_are_refused_with_what_exists() -> None:
+    effect = UndeclaredEffect("striebeck", 0, {})
     with pytest.raises(SpecInvalid, match="stribeck, load-friction"):
-        build_effect(UndeclaredEffect("striebeck", 0, {}), 6)
+        build_effect(effect, 6)
+    parameters = {"rise": 1.0, "speed_rad_s": 0.1}
     with pytest.raises(
         SpecInvalid,
         match=r"unknown parameter rise; missing parameter rise_nm; .* rise_nm, "
         r"speed_rad_s",
     ):
-        build_effect(UndeclaredEffect("stribeck", 0, {"rise": 1.0, "speed_rad_s": 0.1}), 6)
+        build_effect(UndeclaredEffect("stribeck", 0, parameters), 6)
+    undeclared_effect = UndeclaredEffect(
+        "spring", 6, {"stiffness_nm_per_rad": 1.0, "rest_rad": 0.0}
+    )
     with pytest.raises(SpecInvalid, match="axis 7"):
-        build_effect(
-            UndeclaredEffect("spring", 6, {"stiffness_nm_per_rad": 1.0, "rest_rad": 0.0}), 6
-        )
+        build_effect(undeclared_effect, 6)
     with pytest.raises(SpecInvalid, match="other_axis"):
         build_effect(
             UndeclaredEffect(
@@ -446,9 +482,8 @@ def test_unknown_names_and_parameters_are_refused_with_what_exists() -> None:
 
 
 def test_a_drive_too_stiff_for_the_step_is_refused() -> None:
-    effect = UndeclaredEffect(
-        "elasticity", 5, {"stiffness_nm_per_rad": 1e7, "damping_nm_s_per_rad": 1.0}
-    )
+    parameters = {"stiffness_nm_per_rad": 1e7, "damping_nm_s_per_rad": 1.0}
+    effect = UndeclaredEffect("elasticity", 5, parameters)
     with pytest.raises(SpecInvalid, match="too stiff"):
         Plant(clean_cell(effects=(effect,)))
 
@@ -461,11 +496,13 @@ def test_a_drive_that_is_not_refused_comes_to_rest(
     """The flange without payload is lighter than its motor."""
     parameters = {"stiffness_nm_per_rad": stiffness, "damping_nm_s_per_rad": damping}
     try:
-        plant = Plant(clean_cell(effects=(UndeclaredEffect("elasticity", axis, parameters),)))
+        effects = (UndeclaredEffect("elasticity", axis, parameters),)
+        plant = Plant(clean_cell(effects=effects))
     except SpecInvalid as error:
         assert "too stiff" in str(error)
         return
     plant.velocity_rad_s[axis] = 1.0
     for _ in range(400):
         plant.step(np.zeros(6))
-    assert np.abs(plant.velocity_rad_s).max() < 1.0
+    absolute_velocity_rad_s = np.abs(plant.velocity_rad_s)
+    assert absolute_velocity_rad_s.max() < 1.0

@@ -20,7 +20,8 @@ def problem(seed: int, joints: int, extra: int) -> tuple[np.ndarray, np.ndarray,
     directions = np.vstack(
         [np.eye(joints), rng.integers(-1, 2, (extra, joints)) + np.eye(joints)[:extra] * 3.0]
     )
-    delassus = directions @ np.linalg.inv(factor @ factor.T) @ directions.T
+    inverse = np.linalg.inv(factor @ factor.T)
+    delassus = directions @ inverse @ directions.T
     free = directions @ rng.standard_normal(joints)
     return (
         delassus,
@@ -34,14 +35,16 @@ def problem(seed: int, joints: int, extra: int) -> tuple[np.ndarray, np.ndarray,
 def test_solution_meets_its_conditions_and_only_dissipates(
     seed: int, joints: int, extra: int
 ) -> None:
-    delassus, free, bound = problem(seed, joints, min(extra, joints))
+    smallest_extra = min(extra, joints)
+    delassus, free, bound = problem(seed, joints, smallest_extra)
     impulse = np.zeros(len(free))
     certificate = solve(delassus, free, bound, impulse, TOLERANCE_RAD_S, MAX_SWEEPS, DEPENDENT)
     speed = free + delassus @ impulse
     assert certificate <= TOLERANCE_RAD_S
     assert (np.abs(impulse) <= bound).all()
     inside = np.abs(impulse) < bound
-    assert (np.abs(speed[inside]) <= 2 * TOLERANCE_RAD_S).all()
+    absolute_speed = np.abs(speed[inside])
+    assert (absolute_speed <= 2 * TOLERANCE_RAD_S).all()
     assert (speed[~inside] * impulse[~inside] <= 2 * TOLERANCE_RAD_S * bound[~inside]).all()
     # Friction takes energy: ½ wᵀ W⁺ w falls by −λᵀ(w + w_free)/2.
     assert impulse @ (speed + free) <= 1e-9
@@ -77,27 +80,28 @@ def test_an_unfinished_solution_says_so() -> None:
     delassus = np.array([[1.0, 0.999], [0.999, 1.0]])
     free = np.array([1.0, -1.0])
     impulse = np.zeros(2)
-    assert (
-        solve(delassus, free, np.full(2, 1e6), impulse, TOLERANCE_RAD_S, 3, DEPENDENT)
-        > TOLERANCE_RAD_S
-    )
+    bound = np.full(2, 1e6)
+    assert solve(delassus, free, bound, impulse, TOLERANCE_RAD_S, 3, DEPENDENT) > TOLERANCE_RAD_S
 
 
 def test_known_case() -> None:
     impulse = np.zeros(1)
+    delassus = np.array([[2.0]])
+    bound = np.array([1.0])
     solve(
-        np.array([[2.0]]),
+        delassus,
         np.array([3.0]),
-        np.array([1.0]),
+        bound,
         impulse,
         TOLERANCE_RAD_S,
         MAX_SWEEPS,
         DEPENDENT,
     )
     assert impulse[0] == pytest.approx(-1.0)  # slides: 3 − 2·1 > 0
+    free = np.array([3.0])
     solve(
         np.array([[2.0]]),
-        np.array([3.0]),
+        free,
         np.array([9.0]),
         impulse,
         TOLERANCE_RAD_S,

@@ -125,7 +125,8 @@ def test_a_deaf_client_is_disconnected_and_the_others_hear_everything(
                 frames = 0
                 with suppress(OSError):
                     while frames < count:
-                        frames += reading.recv(1 << 16).count(b">")
+                        timeout = 1 << 16
+                        frames += reading.recv(timeout).count(b">")
                 heard.append(frames)
 
             reader = threading.Thread(target=read)

@@ -61,16 +61,19 @@ def test_axes_of_a_killed_master_come_to_rest_without_sync(
     clock = Clock()
     with running(spec, request.node.name, clock) as (cell, master):
         set_up(master, option=option)
-        begin_move(master, spec, spec.start_rad + 0.8, 0.5, 0.1)
+        target = spec.start_rad + 0.8
+        begin_move(master, spec, target, 0.5, 0.1)
         for _ in range(CYCLES):
             master.sync()
-        assert np.abs(cell.plant.velocity_rad_s).min() > 0.5
+        absolute_velocity_rad_s = np.abs(cell.plant.velocity_rad_s)
+        assert absolute_velocity_rad_s.min() > 0.5
         frozen = cell.cycles
         let_go_on(master, clock, 0.001 * GUARD_MS - 0.04)
         # The guard has not expired: a late master finds everything as it was
         assert cell.cycles == frozen
         let_go_on(master, clock, 2.0)
-        assert {node.drive.state for node in cell.nodes} == {state}
+        states = {node.drive.state for node in cell.nodes}
+        assert states == {state}
         assert np.abs(cell.plant.velocity_rad_s).max() < 1e-3
         rested = cell.cycles
         assert 100 < rested - frozen < 1000
@@ -86,12 +89,14 @@ def test_an_axis_that_watches_no_one_ends_its_move_as_at_a_bus_with_time_of_its_
     clock = Clock()
     with running(spec, request.node.name, clock) as (cell, master):
         set_up(master, guarded=range(2, 7))
-        begin_move(master, spec, spec.start_rad + 0.8, 0.5, 0.1)
+        target = spec.start_rad + 0.8
+        begin_move(master, spec, target, 0.5, 0.1)
         for _ in range(CYCLES):
             master.sync()
         let_go_on(master, clock, 3.0)
         states = [node.drive.state for node in cell.nodes]
-        assert states == [PowerState.OPERATION_ENABLED, *[PowerState.SWITCH_ON_DISABLED] * 5]
+        expected = [PowerState.OPERATION_ENABLED, *[PowerState.SWITCH_ON_DISABLED] * 5]
+        assert states == expected
         assert cell.plant.position_rad[0] == pytest.approx(spec.start_rad[0] + 0.8, abs=0.01)
         assert cell.plant.position_rad[1] < spec.start_rad[1] + 0.7
 
@@ -105,7 +110,8 @@ def test_an_axis_that_is_only_switched_on_goes_off_with_its_master(
         for controlword in (0x00, 0x06, 0x07):
             master.control(SIX, controlword)
             master.sync()
-        assert {node.drive.state for node in cell.nodes} == {PowerState.SWITCHED_ON}
+        states = {node.drive.state for node in cell.nodes}
+        assert states == {PowerState.SWITCHED_ON}
         let_go_on(master, clock, 1.0)
         assert {node.drive.state for node in cell.nodes} == {PowerState.SWITCH_ON_DISABLED}
 
@@ -118,12 +124,14 @@ def test_a_sync_ends_the_time_without_sync(request: pytest.FixtureRequest) -> No
     clock = Clock()
     with running(spec, request.node.name, clock) as (cell, master):
         set_up(master)
-        begin_move(master, spec, spec.start_rad + 0.8, 0.5, 0.1)
+        target = spec.start_rad + 0.8
+        begin_move(master, spec, target, 0.5, 0.1)
         for _ in range(CYCLES):
             master.sync()
         let_go_on(master, clock, 0.001 * GUARD_MS + 0.06)
         stopping = cell.cycles
-        assert {node.drive.state for node in cell.nodes} == {PowerState.QUICK_STOP_ACTIVE}
+        states = {node.drive.state for node in cell.nodes}
+        assert states == {PowerState.QUICK_STOP_ACTIVE}
         master.send(0x080, b"")
         master.read(1, 0x6041, 0, "H")
         let_go_on(master, clock, 2.0)
@@ -164,7 +172,8 @@ def test_a_master_that_is_late_within_the_guard_gets_the_same_bytes(
         clock = Clock()
         with running(spec, request.node.name, clock) as (_, master):
             set_up(master)
-            begin_move(master, spec, spec.start_rad + 0.3, 0.25, 0.1)
+            target = spec.start_rad + 0.3
+            begin_move(master, spec, target, 0.25, 0.1)
             for cycle in range(120):
                 if cycle % 30 == 0:
                     let_go_on(master, clock, pause_s)

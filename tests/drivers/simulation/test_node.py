@@ -35,10 +35,12 @@ def master(request: pytest.FixtureRequest) -> Iterator[Master]:
 def test_boot_up_and_identity(master: Master) -> None:
     for axis in clean_cell().axes:
         found = [master.read(axis.node_id, 0x1018, sub, "I") for sub in range(1, 5)]
-        assert found == [axis.vendor_id, axis.product_code, axis.revision, axis.serial]
+        expected = [axis.vendor_id, axis.product_code, axis.revision, axis.serial]
+        assert found == expected
         assert master.read(axis.node_id, 0x1000, 0, "I") & 0xFFFF == 402
     boots = [can_id for can_id, data in master.others if data == b"\x00"]
-    assert boots == [0x700 + node_id for node_id in SIX]
+    node_ids = [0x700 + node_id for node_id in SIX]
+    assert boots == node_ids
 
 
 def test_an_independent_sdo_client_understands_the_server(request: pytest.FixtureRequest) -> None:
@@ -53,7 +55,8 @@ def test_an_independent_sdo_client_understands_the_server(request: pytest.Fixtur
             node = network.add_node(3, canopen.ObjectDictionary())
             # Segmented
             assert node.sdo.upload(0x1008, 0).decode() == "drivegain simulated CiA 402 amplifier"
-            node.sdo.download(0x6081, 0, struct.pack("<I", 1234))
+            packed = struct.pack("<I", 1234)
+            node.sdo.download(0x6081, 0, packed)
             assert node.sdo.upload(0x6081, 0) == struct.pack("<I", 1234)
             node.sdo.download(0x6083, 0, struct.pack("<I", 77), force_segment=True)
             assert node.sdo.upload(0x6083, 0) == struct.pack("<I", 77)
@@ -114,7 +117,8 @@ def test_transmission_type_counts_syncs(master: Master) -> None:
     for _ in range(9):
         master.sync(5 + ((len(frames) + 1) % 3 == 0))
         frames.append(sum(can_id == 0x181 for can_id, _ in master.answers))
-    assert frames == [0, 0, 1, 1, 1, 2, 2, 2, 3]
+    expected = [0, 0, 1, 1, 1, 2, 2, 2, 3]
+    assert frames == expected
 
 
 def test_synchronous_receive_pdos_wait_for_sync_and_event_driven_ones_do_not(
@@ -144,12 +148,14 @@ def test_a_stopped_node_is_silent_but_for_its_heartbeat(master: Master) -> None:
     master.set_up(SIX)
     master.sync()
     master.send(0x000, bytes([2, 3]))
-    master.send(0x603, struct.pack("<BHBI", 0x40, 0x6041, 0, 0))
+    packed = struct.pack("<BHBI", 0x40, 0x6041, 0, 0)
+    master.send(0x603, packed)
     master.others.clear()
     for _ in range(250):
         answer = master.sync(5)
         assert len(answer) == 5
-    assert not [can_id for can_id, _ in master.answers[6:] if can_id == 0x183]
+    can_ids = [can_id for can_id, _ in master.answers[6:] if can_id == 0x183]
+    assert not can_ids
     assert not [can_id for can_id, _ in master.others if can_id == 0x583]
     assert master.read(2, 0x6041, 0, "H")  # the others still answer
     master.send(0x000, bytes([1, 3]))
@@ -180,7 +186,8 @@ def test_heartbeats_come_by_wall_time_without_sync(request: pytest.FixtureReques
         SimulatedCell(clean_cell(), far, clock),
     ):
         seen = [Master(near).receive() for _ in range(18)]
-    assert seen[:6] == [(0x700 + node_id, b"\x00") for node_id in SIX]
+    expected = [(0x700 + node_id, b"\x00") for node_id in SIX]
+    assert seen[:6] == expected
     assert seen[6:12] == [(0x700 + node_id, b"\x7f") for node_id in SIX]
 
 
@@ -205,10 +212,13 @@ def test_no_object_reports_the_true_gain(request: pytest.FixtureRequest) -> None
         spec = clean_cell()
         axes = tuple(replace(axis, gain_nm_per_a=scale * axis.gain_nm_per_a) for axis in spec.axes)
         with can.Bus(interface="virtual", channel=request.node.name) as far:
-            cell = SimulatedCell(replace(spec, axes=axes), far, STOPPED_CLOCK)
-            entries = [
-                (i, s) for i in range(0x1000, 0x7000) for s in range(9) if not 0x1400 <= i <= 0x1BFF
-            ]
+            changed_spec = replace(spec, axes=axes)
+            cell = SimulatedCell(changed_spec, far, STOPPED_CLOCK)
+            entries = []
+            for i in range(0x1000, 0x7000):
+                for s in range(9):
+                    if not 0x1400 <= i <= 0x1BFF:
+                        entries.append((i, s))
             known = [
                 key for key in entries if key in cell.nodes[0]._dictionary and key != (0x1003, 1)
             ]

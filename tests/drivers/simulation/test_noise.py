@@ -41,7 +41,8 @@ def hold(spec: CellSpec, steps: int) -> tuple[FloatArray, FloatArray, FloatArray
     """
     plant = Plant(spec)
     amplifiers = AmplifierSet(spec, plant)
-    plant.set_brakes(np.zeros(6, dtype=np.bool_))
+    closed = np.zeros(6, dtype=np.bool_)
+    plant.set_brakes(closed)
     amplifiers.loops["enabled"] = 1
     disturbance_nm, current_a, motor_rad = (np.empty((steps, 6)) for _ in range(3))
     for k in range(steps):
@@ -62,9 +63,8 @@ def test_coloured_noise_has_its_deviation_and_its_correlation_from_the_first_val
     sigma: float, correlation_s: float, seed: int
 ) -> None:
     n = 600
-    noise = ColouredNoise(
-        random_streams(seed, n, 7), np.full(n, sigma), np.full(n, correlation_s), STEP_S
-    )
+    streams = random_streams(seed, n, 7)
+    noise = ColouredNoise(streams, np.full(n, sigma), np.full(n, correlation_s), STEP_S)
     values = [noise.value, *(noise.advance() for _ in range(8))]
     for lag in (0, 1, 8):
         if correlation_s:
@@ -87,21 +87,27 @@ def test_the_disturbance_is_a_share_of_the_rated_torque_with_its_correlation_tim
     # 10 s are 2 500 independent values of a correlation time of 2 ms.
     np.testing.assert_allclose(values.std(axis=0) / rated_nm, 0.01 * PERCENT, rtol=0.06)
     centred = values - values.mean(axis=0)
-    correlation = (centred[8:] * centred[:-8]).mean(axis=0) / centred.var(axis=0)
-    np.testing.assert_allclose(correlation, np.exp(-1.0), atol=0.06)
-    assert np.abs(np.corrcoef(values.T) - np.eye(6)).max() < 0.1  # each axis has its own
+    centred_variance = centred.var(axis=0)
+    correlation = (centred[8:] * centred[:-8]).mean(axis=0) / centred_variance
+    expected = np.exp(-1.0)
+    np.testing.assert_allclose(correlation, expected, atol=0.06)
+    difference = np.corrcoef(values.T) - np.eye(6)
+    assert np.abs(difference).max() < 0.1  # each axis has its own
 
 
 def test_below_the_bandwidth_the_current_carries_the_disturbance_and_above_it_the_arm_moves() -> (
     None
 ):
-    spec = disturbed(np.full(6, 5.0), 0.05)
+    percent = np.full(6, 5.0)
+    spec = disturbed(percent, 0.05)
     disturbance_nm, current_a, motor_rad = (values[2_000:] for values in hold(spec, 10_000))
-    gain = np.array([axis.gain_nm_per_a for axis in spec.axes])
+    gain_nm_per_a = [axis.gain_nm_per_a for axis in spec.axes]
+    gain = np.array(gain_nm_per_a)
     window = np.hanning(len(current_a))[:, None]
 
     def spectrum(values: FloatArray) -> FloatArray:
-        return np.asarray(np.fft.rfft(window * (values - values.mean(axis=0)), axis=0))
+        difference = values - values.mean(axis=0)
+        return np.asarray(np.fft.rfft(window * difference, axis=0))
 
     frequency_hz = np.fft.rfftfreq(len(current_a), STEP_S)
     force = spectrum(disturbance_nm)
@@ -109,14 +115,14 @@ def test_below_the_bandwidth_the_current_carries_the_disturbance_and_above_it_th
     low = (frequency_hz > 0.4) & (frequency_hz < 2.0)
     high = (frequency_hz > 100.0) & (frequency_hz < 300.0)
     for band, expected, tolerance in ((low, -1.0, 0.03), (high, 0.0, 0.1)):
+        absolute_force = np.abs(force[band])
         transfer = np.sum(answer[band] * np.conj(force[band]), axis=0) / np.sum(
-            np.abs(force[band]) ** 2, axis=0
+            absolute_force**2, axis=0
         )
         np.testing.assert_allclose(transfer.real, expected, atol=tolerance)
+    motor_rad_std = motor_rad.std(axis=0)
     counts = (
-        motor_rad.std(axis=0)
-        * np.array([axis.counts_per_revolution for axis in spec.axes])
-        / (2.0 * np.pi)
+        motor_rad_std * np.array([axis.counts_per_revolution for axis in spec.axes]) / (2.0 * np.pi)
     )
     assert (counts > 5.0).all()  # and the encoders see it
 
@@ -129,7 +135,8 @@ def test_without_a_disturbance_nothing_changes_and_with_one_the_current_noise_st
         return np.array([amplifiers._noise.advance() for _ in range(50)])
 
     without = clean_cell()
-    zero = disturbed(np.zeros(6), 0.03)
+    percent = np.zeros(6)
+    zero = disturbed(percent, 0.03)
     with_one = disturbed(PERCENT, 0.03)
     assert Plant(zero)._disturbance is None
     np.testing.assert_array_equal(noise(with_one), noise(without))

@@ -19,12 +19,13 @@ NOT_IN_THIS_STATE = 0x08000022
 
 def test_the_entered_gain_is_reported_in_both_objects(request: pytest.FixtureRequest) -> None:
     spec = clean_cell()
-    axes = (replace(spec.axes[0], entered_gain_nm_per_a=-11.52), *spec.axes[1:])
-    with running(replace(spec, axes=axes), request.node.name) as (_, master):
+    changed_axis = replace(spec.axes[0], entered_gain_nm_per_a=-11.52)
+    axes = (changed_axis, *spec.axes[1:])
+    changed_spec = replace(spec, axes=axes)
+    with running(changed_spec, request.node.name) as (_, master):
         assert master.read(1, GAIN, 1, "i") == -11520
-        assert struct.unpack("<f", struct.pack("<I", master.read(1, GAIN, 2, "I")))[
-            0
-        ] == pytest.approx(-11.52)
+        packed = struct.pack("<I", master.read(1, GAIN, 2, "I"))
+        assert struct.unpack("<f", packed)[0] == pytest.approx(-11.52)
         # Not entered, and the cell does not reveal its true gain
         assert master.read(2, GAIN, 1, "i") == 0
 
@@ -32,7 +33,8 @@ def test_the_entered_gain_is_reported_in_both_objects(request: pytest.FixtureReq
 def test_what_was_stored_comes_back_with_the_power(request: pytest.FixtureRequest) -> None:
     with running(clean_cell(), request.node.name) as (cell, master):
         assert master.write(3, GAIN, 1, "i", 24200) == 0
-        assert cell.nodes[2].saved.values[GAIN, 1] == 0
+        saved = cell.nodes[2].saved.values
+        assert saved[GAIN, 1] == 0
         assert master.write(3, 0x1010, 1, "I", SAVE) == 0
         assert cell.nodes[2].saved.values[GAIN, 1] == 24200
         assert master.write(3, GAIN, 1, "i", 7) == 0

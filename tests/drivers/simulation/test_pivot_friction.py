@@ -30,8 +30,11 @@ def _coasted(spec: CellSpec, seconds: float) -> Plant:
         )
         for axis in spec.axes
     )
-    plant = Plant(replace(spec, axes=axes, passive={}, gravity_m_s2=(0.0, 0.0, 0.0)))
-    plant.set_brakes(np.zeros(len(axes), dtype=np.bool_))
+    gravity_m_s2 = (0.0, 0.0, 0.0)
+    changed_spec = replace(spec, axes=axes, passive={}, gravity_m_s2=gravity_m_s2)
+    plant = Plant(changed_spec)
+    closed = np.zeros(len(axes), dtype=np.bool_)
+    plant.set_brakes(closed)
     plant.velocity_rad_s[:] = plant._basis @ np.array([0.5, -0.3])
     steps = round(seconds / plant._mechanics.step_s)
     for _ in range(steps):
@@ -49,20 +52,24 @@ def _energy_j(plant: Plant) -> float:
 @pytest.mark.parametrize("kind", ["coulomb_nm", "viscous_nm_s_rad"])
 def test_the_energy_that_is_lost_is_the_work_of_the_pivot(kind: str) -> None:
     seconds = 0.05
-    before = _coasted(_spec("five-bar", "tip"), 0.0)
+    spec = _spec("five-bar", "tip")
+    before = _coasted(spec, 0.0)
     free = _coasted(_spec("five-bar", "tip"), seconds)
     rubbing = _coasted(_spec("five-bar", "tip", **{kind: 0.3}), seconds)
     # Angle between the two rods, by their joints: crank-2 + elbow-2 − crank-1 − elbow-1.
     sign = np.array([-1.0, 1.0, -1.0, 1.0])
-    turned = abs(float(sign @ (rubbing.position_rad - before.position_rad)))
+    position_difference_rad = rubbing.position_rad - before.position_rad
+    turned = abs(float(sign @ position_difference_rad))
     speed = 0.5 * abs(float(sign @ (rubbing.velocity_rad_s + before.velocity_rad_s)))
     work = 0.3 * turned * (speed if kind == "viscous_nm_s_rad" else 1.0)
     assert _energy_j(free) == pytest.approx(_energy_j(before), rel=1e-3)
-    assert _energy_j(free) - _energy_j(rubbing) == pytest.approx(work, rel=0.02)
+    difference = _energy_j(free) - _energy_j(rubbing)
+    assert difference == pytest.approx(work, rel=0.02)
 
 
 def test_a_closure_that_is_no_planar_pivot_is_refused() -> None:
+    spec = _spec("orthoglide", "leg-y", coulomb_nm=0.1)
     with pytest.raises(SpecInvalid, match="about more than one direction"):
-        Plant(_spec("orthoglide", "leg-y", coulomb_nm=0.1))
+        Plant(spec)
     with pytest.raises(SpecInvalid, match="no closure 'nose'; there are tip"):
         Plant(_spec("five-bar", "nose", coulomb_nm=0.1))

@@ -46,7 +46,8 @@ def friction_nm(plant: Plant) -> FloatArray:
 
 def currents_for(spec: CellSpec, torque_nm: FloatArray) -> FloatArray:
     """Motor currents that put these torques on the joints (eq. 24)."""
-    gain = np.array([axis.gain_nm_per_a for axis in spec.axes])
+    gain_nm_per_a = [axis.gain_nm_per_a for axis in spec.axes]
+    gain = np.array(gain_nm_per_a)
     return np.asarray(np.linalg.solve(motor_rows(spec.ratio).T, torque_nm) / gain)
 
 
@@ -87,7 +88,9 @@ def test_inverse_dynamics_gives_back_the_applied_torque(payload: str | None) -> 
         after = plant.velocity_rad_s
         motor = rows @ after
         a = (after - v) / step_s
-        if min(np.abs(after).min(), np.abs(motor).min()) < 1e-6:
+        smallest_absolute_after = np.abs(after).min()
+        smallest_absolute_motor = np.abs(motor).min()
+        if min(smallest_absolute_after, smallest_absolute_motor) < 1e-6:
             continue  # something sticks: its friction is whatever holds it
         needed = pin.rnea(model, data, q, v, a) + rows.T @ (inertia * (rows @ a))
         needed += viscous * after + coulomb * np.sign(after) + offset
@@ -141,9 +144,12 @@ def test_a_joint_loaded_below_its_friction_stays_exactly_where_it_is(
     spec = clean_cell(payload)
     model, data = links(spec)
     gravity = pin.computeGeneralizedGravity(model, data, spec.start_rad)
-    bound = np.array([axis.coulomb_nm for axis in spec.axes])
-    offset = np.array([axis.offset_nm for axis in spec.axes])
-    current = currents_for(spec, gravity + offset + np.array(share) * bound)
+    coulomb_nm = [axis.coulomb_nm for axis in spec.axes]
+    bound = np.array(coulomb_nm)
+    offset_nm = [axis.offset_nm for axis in spec.axes]
+    offset = np.array(offset_nm)
+    torque_nm = gravity + offset + np.array(share) * bound
+    current = currents_for(spec, torque_nm)
     plant = Plant(spec)
     plant.set_brakes(OPEN)
     for _ in range(40):
@@ -161,8 +167,9 @@ def test_a_joint_loaded_above_its_friction_moves_that_way(joint: int, sign: floa
         axis.offset_nm for axis in spec.axes
     ]
     # Motor 6 rubs on joints 5 and 6, so both bounds are given in full.
+    coulomb_nm = spec.axes[joint].coulomb_nm
     own = (
-        spec.axes[joint].coulomb_nm
+        coulomb_nm
         + spec.axes[joint].motor_coulomb_nm
         + (joint == 4) * spec.axes[5].motor_coulomb_nm
     )
@@ -176,7 +183,8 @@ def test_a_joint_loaded_above_its_friction_moves_that_way(joint: int, sign: floa
 
 def test_coupled_motors_follow_equations_24_and_25() -> None:
     spec = replace(frictionless(clean_cell()), gravity_m_s2=(0.0, 0.0, 0.0))
-    gain = np.array([axis.gain_nm_per_a for axis in spec.axes])
+    gain_nm_per_a = [axis.gain_nm_per_a for axis in spec.axes]
+    gain = np.array(gain_nm_per_a)
     model, data = links(spec)
     rotor = [axis.motor_inertia_kg_m2 for axis in spec.axes]
     expected = pin.crba(model, data, spec.start_rad) + np.diag(rotor)
@@ -198,8 +206,10 @@ def test_friction_of_the_coupled_motor_acts_on_the_sum_of_both_joints() -> None:
     spec = clean_cell()
     plants = []
     for rubbing in (0.0, 1.6):
-        axes = (*spec.axes[:5], replace(spec.axes[5], motor_coulomb_nm=rubbing))
-        plant = Plant(replace(spec, axes=axes))
+        changed_axis = replace(spec.axes[5], motor_coulomb_nm=rubbing)
+        axes = (*spec.axes[:5], changed_axis)
+        changed_spec = replace(spec, axes=axes)
+        plant = Plant(changed_spec)
         plant.set_brakes(OPEN)
         plant.velocity_rad_s[4:] = [-1.0, 0.4]  # joint 6 forwards, yet motor 6 backwards
         plant.step(np.zeros(6))
@@ -224,7 +234,8 @@ def test_a_payload_adds_exactly_its_weight_to_what_the_brakes_hold(payload: str)
 
     def potential_j(q: FloatArray) -> float:
         pin.forwardKinematics(model, data, q)
-        return float(body.mass_kg * 9.81 * data.oMi[6].act(np.array(body.centre_m))[2])
+        centre_m = np.array(body.centre_m)
+        return float(body.mass_kg * 9.81 * data.oMi[6].act(centre_m)[2])
 
     step = 1e-6
     expected = [
@@ -232,22 +243,26 @@ def test_a_payload_adds_exactly_its_weight_to_what_the_brakes_hold(payload: str)
         / (2 * step)
         for e in np.eye(6)
     ]
-    np.testing.assert_allclose(held[payload] - held[None], expected, atol=1e-6)
+    difference = held[payload] - held[None]
+    np.testing.assert_allclose(difference, expected, atol=1e-6)
 
 
 def test_what_does_not_fit_together_is_refused() -> None:
     spec = clean_cell()
+    changed_spec = replace(spec, axes=spec.axes[:5])
     with pytest.raises(SpecInvalid, match="6 joints"):
-        Plant(replace(spec, axes=spec.axes[:5]))
+        Plant(changed_spec)
+    ratio = np.zeros((6, 6))
     with pytest.raises(SpecInvalid, match="invertible"):
-        Plant(replace(spec, ratio=np.zeros((6, 6))))
+        Plant(replace(spec, ratio=ratio))
     with pytest.raises(SpecInvalid, match="cannot be read"):
         Plant(replace(spec, urdf="<robot"))
+    urdf = spec.urdf.replace('name="J1" type="revolute"', 'name="J1" type="continuous"')
     with pytest.raises(SpecInvalid, match="continuous"):
         Plant(
             replace(
                 spec,
-                urdf=spec.urdf.replace('name="J1" type="revolute"', 'name="J1" type="continuous"'),
+                urdf=urdf,
             )
         )
 
@@ -262,8 +277,10 @@ def test_a_motor_on_another_joint_brakes_that_joint() -> None:
     spec = clean_cell()
     ratio = spec.ratio.copy()
     ratio[[0, 1]] = ratio[[1, 0]]  # motor 1 drives joint 2, motor 2 joint 1
-    plant = Plant(replace(spec, ratio=ratio))
-    plant.set_brakes(np.array([False, True, True, True, True, True]))
+    changed_spec = replace(spec, ratio=ratio)
+    plant = Plant(changed_spec)
+    closed = np.array([False, True, True, True, True, True])
+    plant.set_brakes(closed)
     for _ in range(200):
         plant.step(np.zeros(6))
     assert plant.velocity_rad_s[1] != 0.0  # joint 2 falls, for the brake of its motor is open

@@ -44,7 +44,8 @@ def test_a_move_ends_at_rest_on_its_target_within_its_limits(
     assert move.target == target
     assert position == pytest.approx(target, abs=1e-6 * scale)
     assert abs(left) <= 1e-6 * (1.0 + fastest)
-    assert fastest <= max(speed, abs(velocity)) * (1.0 + 1e-9)
+    largest_speed = max(speed, abs(velocity))
+    assert fastest <= largest_speed * (1.0 + 1e-9)
     assert len(move.duration_s) == SEGMENTS
     assert min(move.duration_s) >= 0.0
     assert all(abs(a) in (0.0, acceleration, deceleration) for a in move.acceleration)
@@ -53,7 +54,8 @@ def test_a_move_ends_at_rest_on_its_target_within_its_limits(
 def test_a_textbook_trapezoid() -> None:
     move = plan(0.0, 0.0, 100.0, 10.0, 5.0, 10.0)
     assert move.duration_s[:3] == pytest.approx((2.0, 8.5, 1.0))
-    assert move.acceleration[:3] == (5.0, 0.0, -10.0)
+    expected = (5.0, 0.0, -10.0)
+    assert move.acceleration[:3] == expected
 
 
 @given(start=PLACE, velocity=st.floats(-1e5, 1e5), deceleration=LIMIT)
@@ -66,4 +68,5 @@ def test_a_stop_ends_at_rest_where_it_says(
         move.target, abs=1e-6 * (1.0 + abs(start) + velocity**2 / deceleration)
     )
     assert abs(left) <= 1e-6 * (1.0 + abs(velocity))
-    assert (move.target - start) * velocity >= 0.0
+    target_difference = move.target - start
+    assert target_difference * velocity >= 0.0

@@ -48,8 +48,12 @@ def test_a_late_sync_moves_no_time_and_brings_its_bus_back() -> None:
 def test_every_round_of_syncs_is_one_cycle(buses: int, rounds: list[list[int]]) -> None:
     gate = SyncGate(buses)
     for order in rounds:
-        ran = [wires for bus in order if bus < buses for wires in gate.arrive(bus)]
-        assert ran == [frozenset(range(buses))]
+        ran = []
+        for bus in order:
+            if bus < buses:
+                ran.extend(gate.arrive(bus))
+        expected = [frozenset(range(buses))]
+        assert ran == expected
 
 
 @given(st.lists(st.integers(0, 1), max_size=200))
@@ -61,11 +65,13 @@ def test_a_bus_that_is_handed_on_in_bursts_loses_no_cycle(order: list[int]) -> N
     come = Counter[int]()
     cycles = 0
     for bus in order:
-        if come[bus] - come[1 - bus] >= PATIENCE:
+        come_difference = come[bus] - come[1 - bus]
+        if come_difference >= PATIENCE:
             continue
         come[bus] += 1
         assert not gate.late(bus)
         ran = gate.arrive(bus)
         assert set(ran) <= {BOTH}
         cycles += len(ran)
-        assert cycles == min(come[0], come[1])
+        expected = min(come[0], come[1])
+        assert cycles == expected

@@ -80,7 +80,8 @@ def bench() -> Iterator[Bench]:
         }
     with network:
         network.prepare()
-        stream = SyncStream(network, LockstepSync(scripted.PERIOD_NS, 0.005, clock=bus.clock))
+        pacing = LockstepSync(scripted.PERIOD_NS, 0.005, clock=bus.clock)
+        stream = SyncStream(network, pacing)
         yield Bench(network, bus, stream)
         bus.tamper = lambda message: (message,)
 
@@ -99,7 +100,8 @@ def test_readings_are_in_si_and_come_at_their_rates(bench: Bench) -> None:
     lasted_ns = CYCLES * scripted.PERIOD_NS
     for quantity, period_ns in PERIOD_NS.items():
         own = [r.time_ns for r in bench.readings if (r.axis, r.quantity) == (0, quantity)]
-        assert len(own) == -(-lasted_ns // period_ns)
+        expected = -(-lasted_ns // period_ns)
+        assert len(own) == expected
         assert all(samples[0].time_ns <= time_ns <= samples[-1].time_ns for time_ns in own)
     # One request a cycle at most: the drives are read in turn.
     assert {before for _, before in bench.requests()} == {1}
@@ -118,7 +120,8 @@ def test_a_lost_answer_delays_nothing_and_its_object_is_read_again(bench: Bench)
     bench.bus.tamper = lose_one
     samples = [next(bench.stream) for _ in range(CYCLES)]
     assert lost
-    assert [sample.cycle for sample in samples] == list(range(CYCLES))
+    expected = list(range(CYCLES))
+    assert [sample.cycle for sample in samples] == expected
     given_up = GIVEN_UP_NS // scripted.PERIOD_NS
     waited = [r for r in bench.readings if r.time_ns < samples[given_up].time_ns]
     assert waited == []
@@ -129,7 +132,8 @@ def test_a_lost_answer_delays_nothing_and_its_object_is_read_again(bench: Bench)
 
 def test_no_request_goes_with_a_set_point_and_none_after_the_stop(bench: Bench) -> None:
     bench.poll()
-    far = Move((50_000, -40_000), (100_000, 80_000), (1_000_000, 800_000), dwell_cycles=200)
+    target_counts = (50_000, -40_000)
+    far = Move(target_counts, (100_000, 80_000), (1_000_000, 800_000), dwell_cycles=200)
     samples = list(execute(bench.network, bench.stream, (far,), permission(), BOUNDS))
     assert all(sample.missing == 0 for sample in samples)
     assert bench.readings
@@ -152,10 +156,8 @@ def test_an_object_that_a_drive_lacks_is_named_and_left_also_in_the_run(bench: B
     del bench.bus.nodes[0].objects[0x6077, 0]
     for _ in range(CYCLES):
         next(bench.stream)
-    assert {(r.axis, r.quantity) for r in bench.readings} == {
-        (1, Quantity.TORQUE),
-        (0, Quantity.TEMPERATURE),
-    }
+    expected = {(1, Quantity.TORQUE), (0, Quantity.TEMPERATURE)}
+    assert {(r.axis, r.quantity) for r in bench.readings} == expected
     gone = "J1: the torque in 6077h:00 is no longer there; it is not logged"
     captured = [event for event in events if event.kind is EventKind.CAPTURE]
     assert [(event.axis, event.code, event.text) for event in captured] == [(0, 0x6077, gone)]
@@ -180,7 +182,8 @@ def test_more_bytes_than_the_object_has_are_cut_as_at_the_start_of_a_run(bench: 
     for _ in range(CYCLES):
         next(bench.stream)
     torques = {r.value for r in bench.readings if (r.axis, r.quantity) == (0, Quantity.TORQUE)}
-    assert torques == {-2 * 1e-3 * 1.5}
+    expected = {-2 * 1e-3 * 1.5}
+    assert torques == expected
     assert polling.remarks == ()
 
 
@@ -200,7 +203,8 @@ def test_an_object_that_a_drive_refuses_once_is_read_again(bench: Bench, begun: 
     def refuse_one(message: can.Message) -> Iterable[can.Message]:
         if message.arbitration_id != 0x581 or refused or bytes(message.data[1:3]) != b"\x77\x60":
             return (message,)
-        refused.append(struct.pack("<B3sL", 0x80, bytes(message.data[1:4]), 0x0800_0022))
+        packed = struct.pack("<B3sL", 0x80, bytes(message.data[1:4]), 0x0800_0022)
+        refused.append(packed)
         return (can.Message(arbitration_id=0x581, is_extended_id=False, data=refused[0]),)
 
     if begun:
@@ -229,7 +233,8 @@ def test_a_bus_without_room_is_read_before_and_after_alone(bench: Bench) -> None
     before = len(bench.bus.sent)
     for _ in range(CYCLES):
         next(bench.stream)
-    assert not [frame for frame in bench.bus.sent[before:] if frame.arbitration_id > 0x600]
+    frames = [frame for frame in bench.bus.sent[before:] if frame.arbitration_id > 0x600]
+    assert not frames
     assert [(r.time_ns, r.axis, r.value) for r in polling.temperatures(9)] == [
         (9, 0, 31.5),
         (9, 1, -4.0),
@@ -243,4 +248,5 @@ def test_a_torque_without_rated_torque_has_no_unit_and_is_not_read(bench: Bench)
     bench.poll()
     for _ in range(CYCLES):
         next(bench.stream)
-    assert {r.quantity for r in bench.readings} == {Quantity.TEMPERATURE}
+    quantities = {r.quantity for r in bench.readings}
+    assert quantities == {Quantity.TEMPERATURE}

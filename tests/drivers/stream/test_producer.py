@@ -75,7 +75,8 @@ def test_a_drive_pauses_without_being_waited_for_and_starts_again() -> None:
 
 def test_a_drive_that_cannot_produce_says_so_and_is_given_back() -> None:
     network, bus = cell()
-    node = with_sync_objects(bus.nodes[0], period_us=7)
+    first_node = bus.nodes[0]
+    node = with_sync_objects(first_node, period_us=7)
     node.aborts[0x1006, 0] = 0x06010002
     refused = pytest.raises(ObjectAccessError, match="1006h")
     with network, refused as refusal, DriveProducer(network, 0, PERIOD_US) as producer:
@@ -118,5 +119,7 @@ def test_the_kernel_sends_for_less_than_the_amplifiers_wait_and_then_no_more(
 ) -> None:
     """Struct bcm_msg_head: `count` frames every ival1, and then, with ival2 = 0, none."""
     opcode, flags, count, *rest = struct.unpack_from("@3I4l2I0q", setup_message(1, period_us))
-    assert (opcode, flags, rest) == (1, 1, [*divmod(period_us, 1_000_000), 0, 0, 0x80, 1])
-    assert count == max(3, 400_000 // period_us)
+    expected = (1, 1, [*divmod(period_us, 1_000_000), 0, 0, 0x80, 1])
+    assert (opcode, flags, rest) == expected
+    largest_expected = max(3, 400_000 // period_us)
+    assert count == largest_expected

@@ -71,7 +71,8 @@ class Timeline(can.BusABC):
         self._put(at_ns, 0x80, b"", is_rx=is_rx)
         self.sent_ns.append(at_ns)
         for node in self.nodes:
-            delay_ns = self.delays_ns[node - 1][min(self.syncs, CYCLES - 1)]
+            smallest_sync = min(self.syncs, CYCLES - 1)
+            delay_ns = self.delays_ns[node - 1][smallest_sync]
             data = self.syncs.to_bytes(4, "little") + b"\0\0\x50\x02"
             if delay_ns < NEVER:
                 self._put(at_ns + 1 + delay_ns, 0x180 + node, data)
@@ -156,10 +157,12 @@ def run(
         parts = [
             BusPart(f"{n}", BusAddress("virtual", f"{n}"), frozenset((n + 1,))) for n in range(2)
         ]
-        bus = SplitBus(SplitAddress(tuple(parts)), ends, lambda: clock.now_ns * 1e-9)
+        address = SplitAddress(tuple(parts))
+        bus = SplitBus(address, ends, lambda: clock.now_ns * 1e-9)
     network.link._bus = bus
     network.link.sync_producer = "J1" if producer else None
-    followed = FollowedSync(PERIOD_NS, ProducerOnTimeline(ends[0]), timeout_s=0.1, clock=clock)
+    producer_on_timeline = ProducerOnTimeline(ends[0])
+    followed = FollowedSync(PERIOD_NS, producer_on_timeline, timeout_s=0.1, clock=clock)
     stream = SyncStream(network, followed if producer else TimedSync(PERIOD_NS, 0, clock))
     samples = [stream.advance() for _ in range(CYCLES)]
     if to_the_end:
@@ -232,26 +235,27 @@ def test_each_bus_of_two_has_its_own_order(
 ) -> None:
     plain, counts, _ = run(delays_ns, (), producer=False)
     stopped, counts_stopped, _ = run(delays_ns, stops_ns, producer=False, buses=2)
-    assert [(s.cycle, s.position_counts, s.missing) for s in stopped] == [
-        (s.cycle, s.position_counts, s.missing) for s in plain
-    ]
+    expected = [(s.cycle, s.position_counts, s.missing) for s in plain]
+    assert [(s.cycle, s.position_counts, s.missing) for s in stopped] == expected
     assert counts_stopped == counts
 
 
 def test_axes_whose_answers_are_doubtful_are_not_called_silent() -> None:
     delays_ns = [300_000] * 4 + [NEVER] * 3 + [300_000] * (CYCLES - 7)
     _, _, faults = run([delays_ns] * 2, (), producer=True)
-    assert [str(fault) for fault in faults if isinstance(fault, SampleLost)] == [
-        "cycle 7: no answer from J1 (node 1), J2 (node 2)"
-    ]
+    fault_texts = [str(fault) for fault in faults if isinstance(fault, SampleLost)]
+    assert fault_texts == ["cycle 7: no answer from J1 (node 1), J2 (node 2)"]
 
 
 @pytest.mark.parametrize("producer", [True, False])
 def test_two_answers_late_in_a_row_are_in_no_other_sample(producer: bool) -> None:
     late = [300_000] * 4 + [PERIOD_NS + 200_000, PERIOD_NS + 200_000] + [300_000] * (CYCLES - 6)
-    samples, counts, _ = run([late] * 2, (), producer=producer)
-    assert [sample.missing for sample in samples] == [0] * 4 + [3, 3] + [0] * (CYCLES - 6)
-    assert [sample.position_counts[0] for sample in samples if not sample.missing] == [
+    delays_ns = [late] * 2
+    samples, counts, _ = run(delays_ns, (), producer=producer)
+    expected = [0] * 4 + [3, 3] + [0] * (CYCLES - 6)
+    assert [sample.missing for sample in samples] == expected
+    position_counts = [sample.position_counts[0] for sample in samples if not sample.missing]
+    assert position_counts == [
         0,
         1,
         2,
@@ -266,10 +270,10 @@ def test_two_answers_late_in_a_row_are_in_no_other_sample(producer: bool) -> Non
 def test_answers_that_stay_late_are_not_accepted(late_ns: int, producer: bool) -> None:
     delays_ns = [[300_000] * 4 + [PERIOD_NS + late_ns] * (CYCLES - 4), [300_000] * CYCLES]
     # The capture process is stopped at the end: what it has not received yet counts too.
-    samples, counts, _ = run(
-        delays_ns, [(12_500_000, 90_000_000)], producer=producer, to_the_end=True
-    )
-    assert [sample.position_counts[1] for sample in samples] == list(range(CYCLES))
+    stops_ns = [(12_500_000, 90_000_000)]
+    samples, counts, _ = run(delays_ns, stops_ns, producer=producer, to_the_end=True)
+    position_counts = [sample.position_counts[1] for sample in samples]
+    assert position_counts == list(range(CYCLES))
     assert counts.duplicate >= 1
 
 
@@ -277,32 +281,42 @@ def test_answers_that_stay_late_are_not_accepted(late_ns: int, producer: bool) -
 def test_an_answer_that_was_lost_is_no_reason_against_those_after_it(producer: bool) -> None:
     delays_ns = [[300_000] * 4 + [NEVER] + [300_000] * (CYCLES - 5), [300_000] * CYCLES]
     samples, counts, _ = run(delays_ns, (), producer=producer, to_the_end=True)
-    assert [sample.missing for sample in samples] == [0] * 4 + [1, 1] + [0] * (CYCLES - 6)
-    assert counts == StreamStatistics(cycles=CYCLES, frames=2 * CYCLES - 2, missing=2, late=1)
+    expected = [0] * 4 + [1, 1] + [0] * (CYCLES - 6)
+    assert [sample.missing for sample in samples] == expected
+    frames = 2 * CYCLES - 2
+    stream_statistics = StreamStatistics(cycles=CYCLES, frames=frames, missing=2, late=1)
+    assert counts == stream_statistics
 
 
 @pytest.mark.parametrize("producer", [True, False])
 @pytest.mark.parametrize("stop_ms", [30, 100, 300])
 def test_a_stop_of_many_periods_loses_nothing(stop_ms: int, producer: bool) -> None:
     stop = (5 * PERIOD_NS + 1000, 5 * PERIOD_NS + 1_000_000 * stop_ms)
-    samples, counts, faults = run([[300_000] * CYCLES] * 2, [stop], producer=producer)
-    assert [sample.missing for sample in samples] == [0] * CYCLES
-    assert counts == StreamStatistics(cycles=CYCLES, frames=2 * CYCLES)
+    delays_ns = [[300_000] * CYCLES] * 2
+    samples, counts, faults = run(delays_ns, [stop], producer=producer)
+    expected = [0] * CYCLES
+    assert [sample.missing for sample in samples] == expected
+    frames = 2 * CYCLES
+    stream_statistics = StreamStatistics(cycles=CYCLES, frames=frames)
+    assert counts == stream_statistics
     assert [fault for fault in faults if isinstance(fault, BusError)] == []
 
 
 @pytest.mark.parametrize("producer", [True, False])
 def test_a_capture_process_that_stays_stopped_is_a_fault(producer: bool) -> None:
-    _, _, faults = run([[0] * CYCLES] * 2, [(5 * PERIOD_NS, 3 * SECOND_NS)], producer=producer)
+    stops_ns = [(5 * PERIOD_NS, 3 * SECOND_NS)]
+    delays_ns = [[0] * CYCLES] * 2
+    _, _, faults = run(delays_ns, stops_ns, producer=producer)
     assert any(isinstance(fault, BusError) for fault in faults)
 
 
 def test_sync_goes_out_on_schedule_while_frames_are_waited_for() -> None:
     network, scripted = cell()
-    network.link._bus = bus = Timeline(
-        scripted.clock, [[0] * CYCLES] * 2, [(3 * PERIOD_NS, 7 * PERIOD_NS)]
-    )
-    stream = SyncStream(network, TimedSync(PERIOD_NS, 0, scripted.clock))
+    stops_ns = [(3 * PERIOD_NS, 7 * PERIOD_NS)]
+    delays_ns = [[0] * CYCLES] * 2
+    network.link._bus = bus = Timeline(scripted.clock, delays_ns, stops_ns)
+    pacing = TimedSync(PERIOD_NS, 0, scripted.clock)
+    stream = SyncStream(network, pacing)
     for _ in range(CYCLES):
         stream.advance()
     bus.shutdown()

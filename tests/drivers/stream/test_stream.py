@@ -43,7 +43,8 @@ def prepared(axes: int = 2, timed: bool = False) -> Iterator[Prepared]:
             if timed
             else LockstepSync(PERIOD_NS, 0.01, 77, bus.clock)
         )
-        yield SyncStream(network, pacing, events.append), bus, events
+        sync_stream = SyncStream(network, pacing, events.append)
+        yield sync_stream, bus, events
         bus.tamper = lambda message: (message,)
         for node in bus.nodes:
             node.beats = True
@@ -78,20 +79,27 @@ def drop(bus: ScriptedBus, cob_id: int, cycles: range) -> None:
 def test_samples_carry_the_syncs_time_and_all_axes(lockstep: Prepared) -> None:
     stream, _, _ = lockstep
     samples = [next(stream) for _ in range(5)]
-    assert [sample.cycle for sample in samples] == [0, 1, 2, 3, 4]
-    assert [sample.time_ns for sample in samples] == [77 + PERIOD_NS * k for k in range(5)]
-    assert [sample.position_counts for sample in samples] == [(k, k) for k in range(5)]
-    assert stream.statistics == StreamStatistics(cycles=5, frames=10)
+    expected = [0, 1, 2, 3, 4]
+    assert [sample.cycle for sample in samples] == expected
+    time_ns = [sample.time_ns for sample in samples]
+    assert time_ns == [77 + PERIOD_NS * k for k in range(5)]
+    position_counts = [sample.position_counts for sample in samples]
+    assert position_counts == [(k, k) for k in range(5)]
+    stream_statistics = StreamStatistics(cycles=5, frames=10)
+    assert stream.statistics == stream_statistics
 
 
 def test_a_missing_frame_is_a_bit_and_repeats_the_last_value(lockstep: Prepared) -> None:
     stream, bus, events = lockstep
     drop(bus, 0x182, range(2, 3))
     samples = [next(stream) for _ in range(5)]
-    assert [sample.missing for sample in samples] == [0, 0, 0b10, 0, 0]
-    assert [sample.position_counts[1] for sample in samples] == [0, 1, 1, 3, 4]
+    expected = [0, 0, 0b10, 0, 0]
+    assert [sample.missing for sample in samples] == expected
+    position_counts = [sample.position_counts[1] for sample in samples]
+    assert position_counts == [0, 1, 1, 3, 4]
     assert [sample.position_counts[0] for sample in samples] == [0, 1, 2, 3, 4]
-    assert stream.statistics == StreamStatistics(cycles=5, frames=9, missing=1)
+    stream_statistics = StreamStatistics(cycles=5, frames=9, missing=1)
+    assert stream.statistics == stream_statistics
     lost = [event for event in events if event.kind is EventKind.SAMPLE_LOST]
     assert [(event.axis, event.code, event.time_ns) for event in lost] == [
         (1, 2, samples[2].time_ns)
@@ -112,16 +120,20 @@ def test_a_late_frame_is_never_taken_for_the_next_cycles(lockstep: Prepared) -> 
 
     bus.tamper = hold_one
     samples = [next(stream) for _ in range(5)]
-    assert [sample.missing for sample in samples] == [0, 0, 0b10, 0, 0]
-    assert [sample.position_counts[1] for sample in samples] == [0, 1, 1, 3, 4]
-    assert stream.statistics == StreamStatistics(cycles=5, frames=9, missing=1, late=1)
+    expected = [0, 0, 0b10, 0, 0]
+    assert [sample.missing for sample in samples] == expected
+    position_counts = [sample.position_counts[1] for sample in samples]
+    assert position_counts == [0, 1, 1, 3, 4]
+    stream_statistics = StreamStatistics(cycles=5, frames=9, missing=1, late=1)
+    assert stream.statistics == stream_statistics
 
 
 def test_a_late_frame_between_two_syncs_is_dropped(lockstep: Prepared) -> None:
     stream, bus, _ = lockstep
     drop(bus, 0x181, range(1, 2))
     assert [next(stream).missing for _ in range(2)] == [0, 1]
-    bus.inject(can.Message(arbitration_id=0x181, is_extended_id=False, data=b"\xff" * 8))
+    message = can.Message(arbitration_id=0x181, is_extended_id=False, data=b"\xff" * 8)
+    bus.inject(message)
     sample = next(stream)
     assert (sample.missing, sample.position_counts[0]) == (0, 2)
     assert stream.statistics.late == 1
@@ -131,15 +143,18 @@ def test_a_duplicate_is_counted_and_changes_nothing(lockstep: Prepared) -> None:
     stream, bus, _ = lockstep
     bus.tamper = lambda m: (m, m) if m.arbitration_id == 0x181 and bus.cycle == 1 else (m,)
     samples = [next(stream) for _ in range(4)]
-    assert [sample.position_counts for sample in samples] == [(k, k) for k in range(4)]
-    assert stream.statistics == StreamStatistics(cycles=4, frames=8, duplicate=1)
+    expected = [(k, k) for k in range(4)]
+    assert [sample.position_counts for sample in samples] == expected
+    stream_statistics = StreamStatistics(cycles=4, frames=8, duplicate=1)
+    assert stream.statistics == stream_statistics
 
 
 def test_a_duplicate_of_the_last_axis_is_found_before_the_next_sync(lockstep: Prepared) -> None:
     stream, bus, _ = lockstep
     bus.tamper = lambda m: (m, m) if m.arbitration_id == 0x182 and bus.cycle == 1 else (m,)
     samples = [next(stream) for _ in range(4)]
-    assert [sample.position_counts for sample in samples] == [(k, k) for k in range(4)]
+    expected = [(k, k) for k in range(4)]
+    assert [sample.position_counts for sample in samples] == expected
     assert stream.statistics.duplicate == 1
 
 
@@ -156,36 +171,42 @@ def test_a_cut_frame_is_counted_and_missing(lockstep: Prepared, length: int) -> 
 
     bus.tamper = cut
     assert [next(stream).missing for _ in range(3)] == [0, 1, 0]
-    assert stream.statistics == StreamStatistics(cycles=3, frames=5, missing=1, wrong_length=1)
+    expected = StreamStatistics(cycles=3, frames=5, missing=1, wrong_length=1)
+    assert stream.statistics == expected
 
 
 def test_frames_of_others_and_from_before_are_foreign(lockstep: Prepared) -> None:
     stream, bus, _ = lockstep
     # Before the first SYNC
-    bus.inject(can.Message(arbitration_id=0x181, is_extended_id=False, data=b"\xff" * 8))
+    message = can.Message(arbitration_id=0x181, is_extended_id=False, data=b"\xff" * 8)
+    bus.inject(message)
     next(stream)
     # Of a foreign node
     bus.inject(can.Message(arbitration_id=0x385, is_extended_id=False, data=bytes(8)))
     # Another identifier
     bus.inject(can.Message(arbitration_id=0x181, is_extended_id=True, data=b"\xff" * 8))
     assert next(stream).position_counts == (1, 1)
-    assert stream.statistics == StreamStatistics(cycles=2, frames=4, foreign=3)
+    expected = StreamStatistics(cycles=2, frames=4, foreign=3)
+    assert stream.statistics == expected
 
 
 def test_a_frame_that_an_axis_was_not_asked_to_send_is_surplus(lockstep: Prepared) -> None:
     stream, bus, _ = lockstep
     next(stream)
     # TPDO4 of node 1
-    bus.inject(can.Message(arbitration_id=0x481, is_extended_id=False, data=bytes(8)))
+    message = can.Message(arbitration_id=0x481, is_extended_id=False, data=bytes(8))
+    bus.inject(message)
     assert next(stream).position_counts == (1, 1)
-    assert stream.statistics == StreamStatistics(cycles=2, frames=4, surplus=1)
+    expected = StreamStatistics(cycles=2, frames=4, surplus=1)
+    assert stream.statistics == expected
 
 
 def test_too_many_missing_cycles_in_a_row_end_the_stream(lockstep: Prepared) -> None:
     stream, bus, _ = lockstep
     drop(bus, 0x182, range(1, 100))
     samples = [next(stream) for _ in range(5)]
-    assert [sample.missing for sample in samples] == [0, 2, 2, 2, 2]
+    expected = [0, 2, 2, 2, 2]
+    assert [sample.missing for sample in samples] == expected
     with pytest.raises(SampleLost, match="cycle 4: no answer from J2"):
         next(stream)
 
@@ -196,7 +217,8 @@ def test_emcy_is_an_event_then_a_fault(lockstep: Prepared) -> None:
     bus.inject(bus.nodes[1].emcy(0x7305))
     sample = next(stream)
     emcy = next(event for event in events if event.kind is EventKind.EMCY)
-    assert (emcy.axis, emcy.code, emcy.time_ns) == (1, 0x7305, sample.time_ns)
+    expected = (1, 0x7305, sample.time_ns)
+    assert (emcy.axis, emcy.code, emcy.time_ns) == expected
     with pytest.raises(DriveFault, match=r"J2 \(node 2\): .*7305h") as fault:
         next(stream)
     assert fault.value.emcy_code == 0x7305
@@ -218,7 +240,8 @@ def test_a_new_fault_is_seen_in_the_sample_and_raised_after_it(
 def test_a_fault_from_before_does_not_forbid_to_look(lockstep: Prepared) -> None:
     stream, bus, _ = lockstep
     bus.nodes[0].fault()
-    assert [next(stream).cycle for _ in range(3)] == [0, 1, 2]
+    cycles = [next(stream).cycle for _ in range(3)]
+    assert cycles == [0, 1, 2]
 
 
 @pytest.mark.parametrize("following_error", [False, True])
@@ -230,10 +253,12 @@ def test_an_old_fault_of_an_axis_that_answers_late_is_still_old(
     bus.nodes[1].fault(following_error)
     drop(bus, 0x182, range(2))
     samples = [next(stream) for _ in range(6)]
-    assert [sample.missing for sample in samples] == [2, 2, 0, 0, 0, 0]
+    expected = [2, 2, 0, 0, 0, 0]
+    assert [sample.missing for sample in samples] == expected
     states = [event for event in events if event.kind is EventKind.STATE and event.axis == 1]
+    statusword = samples[2].statusword
     assert [(event.time_ns, event.code) for event in states] == [
-        (samples[2].time_ns, samples[2].statusword[1])
+        (samples[2].time_ns, statusword[1])
     ]
     bus.nodes[1].fault()
     bus.nodes[0].fault()
@@ -249,7 +274,8 @@ def test_a_limit_that_acts_is_an_event_alone(lockstep: Prepared) -> None:
     next(stream)
     bus.nodes[0].statusword &= ~(1 << 11)
     next(stream)
-    assert [event.text for event in events if event.kind is EventKind.LIMIT] == [
+    texts = [event.text for event in events if event.kind is EventKind.LIMIT]
+    assert texts == [
         "J1: a limit is active",
         "J1: the limit is no longer active",
     ]
@@ -268,7 +294,8 @@ def test_heartbeat_loss_is_noticed_within_two_and_a_half_periods(lockstep: Prepa
             bus.clock.now_ns += PERIOD_NS
     lost = next(event for event in events if event.kind is EventKind.HEARTBEAT_LOST)
     assert lost.axis == 1
-    assert lost.time_ns - silent_since <= 2.5 * stream.network.heartbeat_ms * 1_000_000
+    gap_ns = lost.time_ns - silent_since
+    assert gap_ns <= 2.5 * stream.network.heartbeat_ms * 1_000_000
 
 
 def test_a_fast_simulation_is_no_heartbeat_loss(lockstep: Prepared) -> None:
@@ -277,16 +304,19 @@ def test_a_fast_simulation_is_no_heartbeat_loss(lockstep: Prepared) -> None:
     begin = bus.clock.now_ns
     for _ in range(100):  # 100 ms of samples in 25 ms of the clock
         next(stream)
-    assert bus.clock.now_ns - begin < 2 * stream.network.heartbeat_ms * 1_000_000
+    elapsed_ns = bus.clock.now_ns - begin
+    assert elapsed_ns < 2 * stream.network.heartbeat_ms * 1_000_000
 
 
 def test_a_node_that_falls_back_is_a_fault(lockstep: Prepared) -> None:
     stream, bus, events = lockstep
     for _ in range(3):
         next(stream)
-    bus.inject(can.Message(arbitration_id=0x702, is_extended_id=False, data=b"\x7f"))
+    message = can.Message(arbitration_id=0x702, is_extended_id=False, data=b"\x7f")
+    bus.inject(message)
     next(stream)
-    assert events[-1].kind is EventKind.NMT
+    last_event = events[-1]
+    assert last_event.kind is EventKind.NMT
     with pytest.raises(DriveFault, match="left OPERATIONAL, is PRE-OPERATIONAL"):
         next(stream)
 
@@ -303,7 +333,8 @@ def test_a_cut_wire_is_a_bus_error(lockstep: Prepared) -> None:
 def test_timed_syncs_keep_to_the_schedule(timed: Prepared) -> None:
     stream, _, _ = timed
     times = [next(stream).time_ns for _ in range(20)]
-    assert times == [77 + PERIOD_NS * k for k in range(20)]
+    expected = [77 + PERIOD_NS * k for k in range(20)]
+    assert times == expected
 
 
 def test_before_the_first_sync_it_is_already_the_start(timed: Prepared, lockstep: Prepared) -> None:
@@ -318,7 +349,8 @@ def test_a_slipped_schedule_leaves_periods_out_and_counts_them(timed: Prepared) 
     third = next(stream)
     assert stream.statistics.skipped_periods == 2
     assert (second.cycle, third.cycle) == (3, 4)  # periods 1 and 2 had no SYNC
-    assert (third.time_ns - first) == third.cycle * PERIOD_NS
+    expected = third.cycle * PERIOD_NS
+    assert (third.time_ns - first) == expected
 
 
 def test_a_timed_cycle_does_not_wait_beyond_its_period(timed: Prepared) -> None:
@@ -326,10 +358,10 @@ def test_a_timed_cycle_does_not_wait_beyond_its_period(timed: Prepared) -> None:
     drop(bus, 0x181, range(1, 3))
     samples = [next(stream) for _ in range(5)]
     # The answer after it may be a late one
-    assert [sample.missing for sample in samples] == [0, 1, 1, 1, 0]
-    assert [sample.time_ns - samples[0].time_ns for sample in samples] == [
-        PERIOD_NS * k for k in range(5)
-    ]
+    expected = [0, 1, 1, 1, 0]
+    assert [sample.missing for sample in samples] == expected
+    time_ns = [sample.time_ns - samples[0].time_ns for sample in samples]
+    assert time_ns == [PERIOD_NS * k for k in range(5)]
 
 
 @settings(deadline=None)
@@ -427,11 +459,15 @@ def test_a_followed_sync_opens_a_cycle_with_its_own_time(followed: Followed) -> 
         producer.pulse()
         bus.clock.now_ns += 7 * PERIOD_NS  # the time of reading does not matter
         samples.append(next(stream))
-    assert [sample.cycle for sample in samples] == list(range(5))
-    assert [sample.time_ns for sample in samples] == [77 + PERIOD_NS * k for k in range(5)]
-    assert [sample.position_counts for sample in samples] == [(k, k) for k in range(5)]
+    expected = list(range(5))
+    assert [sample.cycle for sample in samples] == expected
+    time_ns = [sample.time_ns for sample in samples]
+    assert time_ns == [77 + PERIOD_NS * k for k in range(5)]
+    position_counts = [sample.position_counts for sample in samples]
+    assert position_counts == [(k, k) for k in range(5)]
     assert len(bus.sent) == sent
-    assert stream.statistics == StreamStatistics(cycles=5, frames=10)
+    stream_statistics = StreamStatistics(cycles=5, frames=10)
+    assert stream.statistics == stream_statistics
     assert [periods for _, periods in producer.steered] == [0, 1, 1, 1, 1]
 
 
@@ -443,9 +479,12 @@ def test_a_reader_that_is_late_loses_nothing(followed: Followed) -> None:
         producer.pulse()
     bus.clock.now_ns += 10**12
     samples = [stream.advance() for _ in range(1000)]
-    assert [sample.position_counts for sample in samples] == [(k, k) for k in range(1, 1001)]
-    assert [sample.time_ns for sample in samples] == [77 + PERIOD_NS * k for k in range(1, 1001)]
-    assert stream.statistics == StreamStatistics(cycles=1001, frames=2002)
+    expected = [(k, k) for k in range(1, 1001)]
+    assert [sample.position_counts for sample in samples] == expected
+    time_ns = [sample.time_ns for sample in samples]
+    assert time_ns == [77 + PERIOD_NS * k for k in range(1, 1001)]
+    stream_statistics = StreamStatistics(cycles=1001, frames=2002)
+    assert stream.statistics == stream_statistics
     # But axes do not move on such old news
     with pytest.raises(BusError, match=r"read 1000\.0 s late"):
         stream.check()
@@ -456,9 +495,11 @@ def test_a_sync_that_did_not_come_is_a_period_that_was_left_out(followed: Follow
     stream, _, producer, _ = followed
     next(stream)
     producer.pulse(3 * PERIOD_NS)
-    producer.pulse(PERIOD_NS // 2 * 3 - 1)  # late, but none is missing
+    after_ns = PERIOD_NS // 2 * 3 - 1
+    producer.pulse(after_ns)  # late, but none is missing
     samples = [next(stream), next(stream)]
-    assert [sample.cycle for sample in samples] == [3, 4]
+    cycles = [sample.cycle for sample in samples]
+    assert cycles == [3, 4]
     assert stream.statistics.skipped_periods == 2
 
 
@@ -474,8 +515,10 @@ def test_a_missing_answer_ends_with_the_next_sync(followed: Followed) -> None:
     samples = [next(stream) for _ in range(3)]
     # The answer after it may be a late one
     assert [sample.missing for sample in samples] == [2, 2, 0]
-    assert [sample.position_counts for sample in samples] == [(1, 0), (2, 0), (3, 3)]
-    assert stream.statistics == StreamStatistics(cycles=4, frames=6, missing=2, late=1)
+    expected = [(1, 0), (2, 0), (3, 3)]
+    assert [sample.position_counts for sample in samples] == expected
+    stream_statistics = StreamStatistics(cycles=4, frames=6, missing=2, late=1)
+    assert stream.statistics == stream_statistics
 
 
 def test_a_silence_that_is_read_late_has_its_own_length(followed: Followed) -> None:
@@ -527,11 +570,13 @@ def test_the_periods_without_a_producer_are_a_gap_in_the_cycles(followed: Follow
     bus.clock.now_ns = producer.at_ns
     before = next(stream)
     after = stream.advance()
-    passed = (after.time_ns - first.time_ns + PERIOD_NS // 2) // PERIOD_NS
+    gap_ns = after.time_ns - first.time_ns
+    passed = (gap_ns + PERIOD_NS // 2) // PERIOD_NS
     assert (before.cycle, after.cycle) == (1, passed)
     assert passed >= 11  # the producer may be silent for ten periods
     assert stream.statistics.skipped_periods == passed - 2
-    assert stream.advance().cycle == passed + 1
+    cycle = stream.advance().cycle
+    assert cycle == passed + 1
 
 
 def test_heartbeats_do_not_hide_that_a_producer_is_dead() -> None:
@@ -549,7 +594,8 @@ def test_heartbeats_do_not_hide_that_a_producer_is_dead() -> None:
         assert stream.advance().missing == 0
         assert bus.clock.now_ns - begun_ns <= 12_000_000
         assert [event.kind for event in events].count(EventKind.SYNC_LOST) == 1
-        assert 0x77F in [frame.arbitration_id for frame in bus.sent[sent:]]  # and ours goes on
+        arbitration_ids = [frame.arbitration_id for frame in bus.sent[sent:]]
+        assert 0x77F in arbitration_ids  # and ours goes on
 
 
 def test_a_producer_that_dies_before_an_answer_came_is_noticed_in_one_bound(
@@ -585,7 +631,8 @@ def test_a_lost_sync_that_cannot_be_replaced_is_not_waited_for_again(followed: F
     with pytest.raises(BusError, match="the wire was cut"):
         stream.advance()
     bus.send = send  # type: ignore[method-assign]
-    assert bus.clock.now_ns - begun_ns <= 2 * PERIOD_NS
+    elapsed_ns = bus.clock.now_ns - begun_ns
+    assert elapsed_ns <= 2 * PERIOD_NS
     assert [event.kind for event in events].count(EventKind.SYNC_LOST) == 1
 
 
@@ -641,14 +688,16 @@ def test_set_points_of_another_master_are_a_fault(lockstep: Prepared) -> None:
     stream, bus, events = lockstep
     next(stream)
     # Of a node that is no axis
-    bus.inject(can.Message(arbitration_id=0x27E, is_extended_id=False, data=bytes(6)))
+    message = can.Message(arbitration_id=0x27E, is_extended_id=False, data=bytes(6))
+    bus.inject(message)
     own = can.Message(arbitration_id=0x201, is_extended_id=False, data=bytes(6), is_rx=False)
     bus.inject(own)
     next(stream)
     stream.check()
     bus.inject(can.Message(arbitration_id=0x402, is_extended_id=False, data=bytes(6)))
     next(stream)
-    assert [event.code for event in events if event.kind is EventKind.BUS_BUSY] == [0x402]
+    codes = [event.code for event in events if event.kind is EventKind.BUS_BUSY]
+    assert codes == [0x402]
     with pytest.raises(BusBusy, match=r"a set-point of J2 \(node 2\) \(402h\)"):
         next(stream)
     assert stream.statistics.surplus == 0
@@ -667,7 +716,8 @@ def test_what_comes_behind_the_last_cycle_is_counted(lockstep: Prepared) -> None
     stream.read_on(0.25)
     assert bus.clock.now_ns - begun_ns == 250_000_000
     assert len(bus.sent) == sent
-    assert stream.statistics == replace(before, duplicate=1, interface_dropped=3)
+    expected = replace(before, duplicate=1, interface_dropped=3)
+    assert stream.statistics == expected
     assert EventKind.FRAMES_DROPPED in [event.kind for event in events]
 
 
@@ -675,11 +725,13 @@ def test_cycles_of_a_producer_that_goes_on_are_no_ones(followed: Followed) -> No
     stream, bus, producer, _ = followed
     next(stream)
     # Doubled, before the next SYNC
-    bus.inject(can.Message(arbitration_id=0x182, is_extended_id=False, data=bytes(8)))
+    message = can.Message(arbitration_id=0x182, is_extended_id=False, data=bytes(8))
+    bus.inject(message)
     for _ in range(5):
         producer.pulse()
     stream.read_on(0.05)
-    assert stream.statistics == StreamStatistics(cycles=1, frames=2, duplicate=1)
+    expected = StreamStatistics(cycles=1, frames=2, duplicate=1)
+    assert stream.statistics == expected
 
 
 def test_a_second_producer_is_another_master(followed: Followed) -> None:
@@ -699,7 +751,8 @@ def test_jitter_is_no_second_producer(late_ns: list[int]) -> None:
     before_ns = 0
     for number, late in enumerate(late_ns, start=1):
         at_ns = number * PERIOD_NS * 9999 // 10000 + late  # and its clock is 100 ppm fast
-        assert not rate.too_fast(at_ns - before_ns)
+        since_last_ns = at_ns - before_ns
+        assert not rate.too_fast(since_last_ns)
         before_ns = at_ns
 
 
@@ -739,7 +792,8 @@ def test_after_an_answer_dropped_from_a_followed_cycle_the_next_is_doubtful(
                 if not sample.missing >> axis & 1:
                     assert sample.position_counts[axis] == number + 1
         assert stream.statistics.missing == sum(sample.missing.bit_count() for sample in samples)
-        assert stream.statistics.missing - stream.statistics.late == len(dropped)
+        missing_difference = stream.statistics.missing - stream.statistics.late
+        assert missing_difference == len(dropped)
 
 
 @settings(deadline=None)
@@ -770,9 +824,10 @@ def test_frames_that_this_machine_lost_are_counted_and_reported(lockstep: Prepar
     bus.losses = Losses(kernel=7, backlog=1, interface=4)
     sample = next(stream)
     next(stream)
-    assert stream.statistics == StreamStatistics(
+    expected = StreamStatistics(
         cycles=3, frames=6, kernel_dropped=2, backlog_dropped=1, interface_dropped=4
     )
+    assert stream.statistics == expected
     reported = [event for event in events if event.kind is EventKind.FRAMES_DROPPED]
     assert [(event.code, event.time_ns) for event in reported] == [
         (count, sample.time_ns) for count in (2, 4, 1)
@@ -784,7 +839,8 @@ def test_what_is_to_be_known_of_the_bus_is_reported_at_the_start(lockstep: Prepa
     bus.remarks = ("a small buffer",)
     next(stream)
     next(stream)
-    assert [event.text for event in events if event.kind is EventKind.CAPTURE] == ["a small buffer"]
+    texts = [event.text for event in events if event.kind is EventKind.CAPTURE]
+    assert texts == ["a small buffer"]
 
 
 def test_a_timed_sync_has_the_kernels_time(timed: Prepared) -> None:
@@ -804,6 +860,8 @@ def test_a_timed_sync_has_the_kernels_time(timed: Prepared) -> None:
 
     bus.send = echo  # type: ignore[method-assign]
     samples = [next(stream) for _ in range(5)]
-    assert [sample.time_ns for sample in samples] == [77 + (PERIOD_NS + 10) * k for k in range(5)]
-    assert stream.statistics == StreamStatistics(cycles=5, frames=10)
+    expected = [77 + (PERIOD_NS + 10) * k for k in range(5)]
+    assert [sample.time_ns for sample in samples] == expected
+    stream_statistics = StreamStatistics(cycles=5, frames=10)
+    assert stream.statistics == stream_statistics
     bus.send = send  # type: ignore[method-assign]

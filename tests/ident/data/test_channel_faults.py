@@ -37,7 +37,8 @@ def motion(seed: int = 0) -> FloatArray:
     2).
     """
     rng = np.random.default_rng(seed)
-    pace = np.clip(np.interp(TIME_S, [0.3, 0.8, 4.7, 5.2], [0.0, 1.0, 1.0, 0.0]), 0.0, 1.0)
+    interpolated_time_s = np.interp(TIME_S, [0.3, 0.8, 4.7, 5.2], [0.0, 1.0, 1.0, 0.0])
+    pace = np.clip(interpolated_time_s, 0.0, 1.0)
     passed_s = np.cumsum(pace) / RATE_HZ
     angle = np.zeros((len(TIME_S), 2))
     for speed in rng.uniform(0.3, 1.5, (3, 2)):
@@ -47,7 +48,8 @@ def motion(seed: int = 0) -> FloatArray:
 
 def currents(position: FloatArray, seed: int = 0) -> FloatArray:
     """Currents with friction, inertia and noise, shape (k, 2)."""
-    noise = np.random.default_rng(seed).normal(scale=NOISE_A, size=position.shape)
+    rng = np.random.default_rng(seed)
+    noise = rng.normal(scale=NOISE_A, size=position.shape)
     velocity = np.gradient(position, 1.0 / RATE_HZ, axis=0)
     return np.asarray(
         0.8 * np.tanh(velocity) + 0.004 * velocity + 0.6 * np.cos(position / 30.0) + noise
@@ -66,7 +68,8 @@ def planted(
 
 def kinds(position: FloatArray, current: FloatArray) -> list[tuple[FaultKind, ChannelKind, int]]:
     """What is found, without where."""
-    return [(one.kind, one.quantity, one.axis) for one in find_faults(position, current, RATE_HZ)]
+    faults = find_faults(position, current, RATE_HZ)
+    return [(one.kind, one.quantity, one.axis) for one in faults]
 
 
 # Sound recordings
@@ -101,7 +104,8 @@ SOUND: dict[str, Callable[[], FloatArray]] = {
 def test_what_only_looks_odd_is_no_fault(kind: str) -> None:
     position = motion()
     position[:, 1] = SOUND[kind]()
-    assert find_faults(position, currents(position), RATE_HZ) == ()
+    faults = find_faults(position, currents(position), RATE_HZ)
+    assert faults == ()
 
 
 # Glitches
@@ -123,15 +127,15 @@ def test_a_glitch_is_found_where_it_is_and_filled_in(
 
     position, current = planted(change, seed=seed)
     (found,) = find_faults(position, current, RATE_HZ)
-    assert (found.kind, found.quantity, found.axis) == (FaultKind.GLITCH, ChannelKind.POSITION, 1)
+    expected = (FaultKind.GLITCH, ChannelKind.POSITION, 1)
+    assert (found.kind, found.quantity, found.axis) == expected
     assert found.stretches.tolist() == [[start, start + samples]]
     assert found.size == pytest.approx(size, rel=0.3, abs=0.05)
     assert not found.is_refused
     sound = motion(seed)
     inside = 10 < start < 5980
-    assert np.abs(mended(position, (found,), RATE_HZ) - sound).max() < (
-        3.0 * COUNT_RAD if inside else 0.05
-    )
+    difference = np.abs(mended(position, (found,), RATE_HZ) - sound)
+    assert difference.max() < (3.0 * COUNT_RAD if inside else 0.05)
 
 
 @pytest.mark.parametrize("samples", [1, 3, 20, 50])
@@ -146,10 +150,13 @@ def test_a_dropout_to_zero_is_filled_in(samples: int) -> None:
             current[zeros, 1] = 0.0
         (found,) = find_faults(position, current, RATE_HZ)
         assert found.kind is FaultKind.GLITCH
-        assert found.stretches.tolist() == [[2000, 2000 + samples]]
+        expected = [[2000, 2000 + samples]]
+        assert found.stretches.tolist() == expected
     sound = currents(motion(1), 1) + 4.0
     filled = mended(current, (found,), RATE_HZ, quantity=ChannelKind.CURRENT)
-    assert np.abs(filled - sound)[zeros].max() < 8.0 * NOISE_A
+    filled_difference = np.abs(filled - sound)
+    largest_filled_difference = filled_difference[zeros].max()
+    assert largest_filled_difference < 8.0 * NOISE_A
 
 
 def test_a_current_where_a_joint_breaks_loose_is_no_glitch() -> None:
@@ -191,14 +198,17 @@ def test_a_glitch_of_held_readings_is_a_reading() -> None:
 
     position, current = planted(change)
     (found,) = find_faults(position, current, RATE_HZ)
-    assert (found.kind, found.stretches.tolist()) == (FaultKind.GLITCH, [[1500, 1510]])
+    expected = (FaultKind.GLITCH, [[1500, 1510]])
+    assert (found.kind, found.stretches.tolist()) == expected
 
 
 def test_a_glitch_of_a_coupled_motor_is_that_of_its_own_axis() -> None:
     motor_rad = motion()
     motor_rad[1500, 0] += 1.0
-    joint_rad = motor_rad @ np.linalg.inv(COUPLED).T
-    (found,) = find_faults(joint_rad, currents(motion()), RATE_HZ, COUPLED)
+    coupled_inverse = np.linalg.inv(COUPLED)
+    joint_rad = motor_rad @ coupled_inverse.T
+    current = currents(motion())
+    (found,) = find_faults(joint_rad, current, RATE_HZ, COUPLED)
     assert (found.kind, found.axis) == (FaultKind.GLITCH, 0)
     sound = motion() @ np.linalg.inv(COUPLED).T
     assert mended(joint_rad, (found,), RATE_HZ, COUPLED) == pytest.approx(sound, abs=1e-5)
@@ -207,15 +217,18 @@ def test_a_glitch_of_a_coupled_motor_is_that_of_its_own_axis() -> None:
 def test_a_frozen_encoder_of_a_coupled_joint_is_found() -> None:
     joint_rad = motion() @ np.linalg.inv(COUPLED).T
     joint_rad[1500:1800, 1] = joint_rad[1500, 1]
-    found = find_faults(joint_rad, currents(motion()), RATE_HZ, COUPLED)
-    assert [(one.kind, one.axis) for one in found] == [(FaultKind.FROZEN, 1)]
+    current = currents(motion())
+    found = find_faults(joint_rad, current, RATE_HZ, COUPLED)
+    expected = [(FaultKind.FROZEN, 1)]
+    assert [(one.kind, one.axis) for one in found] == expected
 
 
 def test_what_is_known_to_be_missing_is_no_finding() -> None:
     position, current = planted(lambda channel: np.copyto(channel[1500:1540], 0.0))
     usable = np.ones(position.shape, dtype=np.bool_)
     usable[1500:1540, 1] = False
-    assert find_faults(position, current, RATE_HZ, usable=usable) == ()
+    faults = find_faults(position, current, RATE_HZ, usable=usable)
+    assert faults == ()
 
 
 # Counters, signs and places
@@ -269,9 +282,12 @@ def test_a_frozen_position_is_left_out_on_every_axis(seconds: float) -> None:
     end = 1500 + round(seconds * RATE_HZ)
     position, current = planted(lambda channel: np.copyto(channel[1500:end], channel[1500]))
     (found,) = find_faults(position, current, RATE_HZ)
-    assert (found.kind, found.quantity, found.axis) == (FaultKind.FROZEN, ChannelKind.POSITION, 1)
+    expected = (FaultKind.FROZEN, ChannelKind.POSITION, 1)
+    assert (found.kind, found.quantity, found.axis) == expected
     assert found.stretches.tolist() == [[1500, end]]
-    data = differentiate(Run("r", TIME_S, position, current), DriveTrain(np.eye(2)), SMALL_TWO)
+    run = Run("r", TIME_S, position, current)
+    drive_train = DriveTrain(np.eye(2))
+    data = differentiate(run, drive_train, SMALL_TWO)
     assert not data.valid[1499:end].any()
     assert data.valid[: 1499 - 101].all()
     assert data.valid[end + 101 :].all()
@@ -282,14 +298,16 @@ def test_a_position_that_freezes_to_the_end_is_found(begin_s: float) -> None:
     begin = round(begin_s * RATE_HZ)
     position, current = planted(lambda channel: np.copyto(channel[begin:], channel[begin]))
     (found,) = find_faults(position, current, RATE_HZ)
-    assert (found.kind, found.quantity, found.axis) == (FaultKind.FROZEN, ChannelKind.POSITION, 1)
+    expected = (FaultKind.FROZEN, ChannelKind.POSITION, 1)
+    assert (found.kind, found.quantity, found.axis) == expected
     assert found.stretches.tolist() == [[begin, len(position)]]
 
 
 def test_a_robot_that_is_stopped_at_once_is_not_frozen() -> None:
     position, _ = planted(lambda _: None)
     position[3300:] = position[3300]
-    assert find_faults(position, currents(position), RATE_HZ) == ()
+    faults = find_faults(position, currents(position), RATE_HZ)
+    assert faults == ()
 
 
 def test_an_axis_without_acceleration_that_is_done_before_the_others_is_not_frozen() -> None:
@@ -297,7 +315,8 @@ def test_an_axis_without_acceleration_that_is_done_before_the_others_is_not_froz
     position[:, 1] = np.interp(
         TIME_S, [0.0, 1.0, 1.6, 2.0, 2.4, 3.0], [0.0, 5.0, 2.0, 9.0, 1.0, 6.0]
     )
-    assert find_faults(position, currents(position), RATE_HZ) == ()
+    faults = find_faults(position, currents(position), RATE_HZ)
+    assert faults == ()
 
 
 def test_a_frozen_current_is_left_out_on_its_axis() -> None:
@@ -305,8 +324,11 @@ def test_a_frozen_current_is_left_out_on_its_axis() -> None:
         lambda channel: np.copyto(channel[1500:1800], channel[1500]), in_current=True
     )
     (found,) = find_faults(position, current, RATE_HZ)
-    assert (found.kind, found.quantity, found.axis) == (FaultKind.FROZEN, ChannelKind.CURRENT, 1)
-    data = differentiate(Run("r", TIME_S, position, current), DriveTrain(np.eye(2)), SMALL_TWO)
+    expected = (FaultKind.FROZEN, ChannelKind.CURRENT, 1)
+    assert (found.kind, found.quantity, found.axis) == expected
+    run = Run("r", TIME_S, position, current)
+    drive_train = DriveTrain(np.eye(2))
+    data = differentiate(run, drive_train, SMALL_TWO)
     assert not data.valid[1499:1799, 1].any()
     assert data.valid[:, 0].all()
 
@@ -314,7 +336,8 @@ def test_a_frozen_current_is_left_out_on_its_axis() -> None:
 @pytest.mark.parametrize("percentile", [96.0, 80.0])
 def test_a_position_at_the_end_of_its_range_is_left_out(percentile: float) -> None:
     def change(channel: FloatArray) -> None:
-        np.minimum(channel, np.percentile(channel, percentile), out=channel)
+        channel_percentile = np.percentile(channel, percentile)
+        np.minimum(channel, channel_percentile, out=channel)
 
     position, current = planted(change, seed=1)
     (found,) = find_faults(position, current, RATE_HZ)
@@ -332,7 +355,8 @@ def test_an_axis_that_stops_and_goes_on_without_acceleration_is_not_frozen() -> 
     position[:, 1] = np.interp(
         TIME_S, [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0], [0.0, 5.0, 5.0, 2.0, 2.0, 9.0, 12.0]
     )
-    assert find_faults(position, currents(position), RATE_HZ) == ()
+    faults = find_faults(position, currents(position), RATE_HZ)
+    assert faults == ()
 
 
 SMALL_TWO = replace(SMALL, standstill_rad_s=(0.1, 0.1))
@@ -360,7 +384,8 @@ def test_a_fit_names_a_glitch_and_has_the_gains_of_the_sound_run() -> None:
     assert found.estimate.gains == pytest.approx(sound.estimate.gains, rel=1e-4)
     (said,) = [one for one in diagnose(found, AXES, TRUTH.gains) if one.name == "readings-damaged"]
     at_s = 3000 / runs[3].rate_hz
-    assert (said.runs, said.axes) == (("r3",), ("J2",))
+    expected = (("r3",), ("J2",))
+    assert (said.runs, said.axes) == expected
     assert f"at {at_s:g} s" in said.found
     assert said.found.endswith("these samples were filled in")
 

@@ -23,11 +23,14 @@ def test_each_row_is_its_whole_window_weighted(
 ) -> None:
     filter_ = decimator(rate_hz, cutoff_hz)
     samples = len(filter_.taps) + extra
-    columns = np.random.default_rng(seed).normal(size=(2, samples))
+    rng = np.random.default_rng(seed)
+    columns = rng.normal(size=(2, samples))
     rows = filter_(columns)
-    assert rows.shape == (2, filter_.rows(samples))
+    expected = (2, filter_.rows(samples))
+    assert rows.shape == expected
     for row, centre in enumerate(filter_.centres(samples)):
-        window = columns[:, centre - filter_.half : centre + filter_.half + 1]
+        centre_difference = centre - filter_.half
+        window = columns[:, centre_difference : centre + filter_.half + 1]
         assert rows[:, row] == pytest.approx(window @ filter_.taps, abs=1e-12)
 
 
@@ -43,7 +46,8 @@ def test_a_long_series_is_decimated_as_its_windows_say(
 ) -> None:
     filter_ = decimator(rate_hz, cutoff_hz)
     samples = LONG_SERIES + extra
-    columns = np.random.default_rng(seed).normal(size=(2, 1, samples))
+    rng = np.random.default_rng(seed)
+    columns = rng.normal(size=(2, 1, samples))
     rows = filter_(columns)
     assert rows.shape == (2, 1, filter_.rows(samples))
     windows = np.lib.stride_tricks.sliding_window_view(columns, len(filter_.taps), axis=-1)
@@ -58,11 +62,14 @@ def test_a_long_series_is_decimated_as_its_windows_say(
 @pytest.mark.parametrize("order", [1, 2, 3, 4, 7, 10])
 @pytest.mark.parametrize("cutoff_hz", [10.0, 40.0, 400.0])
 def test_the_low_pass_is_scipys(order: int, cutoff_hz: float) -> None:
-    values = np.cumsum(np.random.default_rng(order).normal(size=(2, 3000)), axis=1) + 40.0
+    rng = np.random.default_rng(order)
+    cumulative = np.cumsum(rng.normal(size=(2, 3000)), axis=1)
+    values = cumulative + 40.0
     sections = signal.butter(order, cutoff_hz, fs=1000.0, output="sos")
     expected = signal.sosfiltfilt(sections, values, axis=1)
+    largest_absolute_expected = np.abs(expected).max()
     assert low_pass(values, 1000.0, cutoff_hz, order) == pytest.approx(
-        expected, abs=1e-12 * np.abs(expected).max()
+        expected, abs=1e-12 * largest_absolute_expected
     )
 
 

@@ -19,7 +19,8 @@ TRAIN = DriveTrain(np.array([[10.0, 0.0], [10.0, 10.0]]))
 def _run(seconds: float = 4.0, rate_hz: float = 1000.0) -> Run:
     time = np.arange(round(seconds * rate_hz)) / rate_hz
     position = np.stack((np.sin(2 * np.pi * time), np.cos(2 * np.pi * 0.5 * time)), axis=1)
-    return Run("sines", time, position, np.zeros_like(position))
+    current_a = np.zeros_like(position)
+    return Run("sines", time, position, current_a)
 
 
 def test_derivatives_of_slow_sines_are_the_sines_own() -> None:
@@ -32,7 +33,8 @@ def test_derivatives_of_slow_sines_are_the_sines_own() -> None:
     assert data.acceleration_rad_s2[middle, 0] == pytest.approx(
         -(w**2) * np.sin(w * data.time_s[middle]), abs=2e-3 * w**2
     )
-    assert np.array_equal(data.moving, np.abs(data.velocity_rad_s) >= 0.1)
+    absolute_velocity_rad_s = np.abs(data.velocity_rad_s)
+    assert np.array_equal(data.moving, absolute_velocity_rad_s >= 0.1)
     assert np.array_equal(data.motor_moving[:, 1], np.abs(data.velocity_rad_s.sum(axis=1)) >= 0.1)
 
 
@@ -40,10 +42,14 @@ def test_moves_part_where_all_joints_rest() -> None:
     run = _run()
     still = np.repeat(run.position_rad[-1:], 500, axis=0)
     position = np.concatenate((run.position_rad, still, run.position_rad[::-1]))
-    longer = Run("twice", np.arange(len(position)) / 1000.0, position, np.zeros_like(position))
-    data = differentiate(longer, TRAIN, Conditioning(standstill_rad_s=(0.05, 0.05)))
+    time_s = np.arange(len(position)) / 1000.0
+    current_a = np.zeros_like(position)
+    longer = Run("twice", time_s, position, current_a)
+    conditioning = Conditioning(standstill_rad_s=(0.05, 0.05))
+    data = differentiate(longer, TRAIN, conditioning)
     assert data.move[0] != data.move[-1]
-    assert np.all(np.diff(data.move) >= 0)
+    move_steps = np.diff(data.move)
+    assert np.all(move_steps >= 0)
 
 
 @pytest.mark.parametrize(
@@ -90,5 +96,6 @@ def test_bad_recordings_are_named(change: object, message: str) -> None:
 
 
 def test_a_drive_train_must_be_invertible() -> None:
+    ratio = np.array([[1.0, 1.0], [1.0, 1.0]])
     with pytest.raises(ModelError, match="invertible"):
-        DriveTrain(np.array([[1.0, 1.0], [1.0, 1.0]]))
+        DriveTrain(ratio)

@@ -29,7 +29,8 @@ def trapezoid(
     """Positions of one motor that goes from stop to stop at trapezoidal speed,
     with rests of 0.2 s or more.
     """
-    parts = [np.repeat(stops[0], round(0.3 * RATE_HZ))]
+    repeated_stop = np.repeat(stops[0], round(0.3 * RATE_HZ))
+    parts = [repeated_stop]
     for start, end in pairwise(stops):
         way = abs(end - start)
         ramp = min(speed / acceleration, np.sqrt(way / acceleration))
@@ -43,7 +44,9 @@ def trapezoid(
 
 
 def dataset(position: FloatArray, train: DriveTrain = STRAIGHT) -> Dataset:
-    run = Run("run", np.arange(len(position)) / RATE_HZ, position, np.zeros_like(position))
+    time_s = np.arange(len(position)) / RATE_HZ
+    current_a = np.zeros_like(position)
+    run = Run("run", time_s, position, current_a)
     return differentiate(run, train, CONDITIONING)
 
 
@@ -64,12 +67,12 @@ def test_moves_are_found_beneath_a_disturbance(seed: int) -> None:
         0.002
         * np.sin(2.0 * np.pi * rng.uniform(5.0, 15.0) * np.arange(len(asked)) / RATE_HZ)[:, None]
     )
-    found = demanded_positions(dataset(np.asarray(asked + wave, dtype=np.float64)), STRAIGHT)
+    position = np.asarray(asked + wave, dtype=np.float64)
+    found = demanded_positions(dataset(position), STRAIGHT)
     assert found is not None
     speed = np.diff(asked[1:-1], axis=0)
-    assert np.all(
-        np.sum((np.diff(found, axis=0) - speed) ** 2, axis=0) < 0.01 * np.sum(speed**2, axis=0)
-    )
+    difference = np.diff(found, axis=0) - speed
+    assert np.all(np.sum(difference**2, axis=0) < 0.01 * np.sum(speed**2, axis=0))
     # Three numbers a move follow next to nothing of what the disturbance adds to the acceleration.
     added = np.diff(wave[1:-1], n=2, axis=0)
     left = np.diff(found - asked[1:-1], n=2, axis=0)
@@ -84,7 +87,9 @@ def test_coupled_motors_make_the_trapezoids() -> None:
     joints = np.asarray(np.linalg.solve(COUPLED.direction, motors.T).T, dtype=np.float64)
     found = demanded_positions(dataset(joints, COUPLED), COUPLED)
     assert found is not None
-    assert np.max(np.abs(found - joints[1:-1])) < 0.01
+    difference = found - joints[1:-1]
+    largest_absolute_difference = np.max(np.abs(difference))
+    assert largest_absolute_difference < 0.01
 
 
 def test_continuous_motion_has_no_moves() -> None:
@@ -111,24 +116,30 @@ def test_an_axis_that_rests_is_demanded_to_rest() -> None:
 def test_derivatives_are_those_of_the_demanded_positions() -> None:
     asked = as_demanded(with_demand(dataset(two_motors(2)), STRAIGHT, CONDITIONING))
     speed = np.gradient(asked.position_rad, 1.0 / RATE_HZ, axis=0)
-    assert np.max(np.abs(speed - asked.velocity_rad_s)) < 1e-9
-    assert np.max(np.abs(asked.velocity_rad_s)) == pytest.approx(2.0, rel=0.05)
+    speed_difference = np.abs(speed - asked.velocity_rad_s)
+    assert np.max(speed_difference) < 1e-9
+    absolute_velocity_rad_s = np.abs(asked.velocity_rad_s)
+    assert np.max(absolute_velocity_rad_s) == pytest.approx(2.0, rel=0.05)
 
 
 def test_what_corrects_a_run_corrects_its_demand() -> None:
     given = dataset(two_motors(4))
-    placed = (PlacedEffect(LatePosition(applied_s=0.004), 1),)
+    effect = LatePosition(applied_s=0.004)
+    placed = (PlacedEffect(effect, 1),)
     demanded_of_corrected = as_demanded(
         with_demand(corrected_dataset(given, placed), STRAIGHT, CONDITIONING)
     )
     corrected_demand = corrected_dataset(
         as_demanded(with_demand(given, STRAIGHT, CONDITIONING)), placed
     )
-    assert np.max(np.abs(corrected_demand.position_rad - demanded_of_corrected.position_rad)) < 1e-4
-    assert (
-        np.max(np.abs(corrected_demand.velocity_rad_s - demanded_of_corrected.velocity_rad_s))
-        < 0.02
+    position_difference_rad = np.abs(
+        corrected_demand.position_rad - demanded_of_corrected.position_rad
     )
+    assert np.max(position_difference_rad) < 1e-4
+    velocity_difference_rad_s = np.abs(
+        corrected_demand.velocity_rad_s - demanded_of_corrected.velocity_rad_s
+    )
+    assert np.max(velocity_difference_rad_s) < 0.02
     assert np.max(np.abs(given.position_rad - demanded_of_corrected.position_rad)) > 0.005
 
 

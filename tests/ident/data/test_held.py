@@ -59,9 +59,12 @@ def test_a_held_motion_is_filled_in(seed: int, samples: int, count: float) -> No
     assert channel.share == pytest.approx(1.0 - 1.0 / samples, abs=0.03)
     assert channel.hold_s == pytest.approx(samples / RATE_HZ)
     inside = slice(50, -50)
-    worst = np.abs(channel.values - motion)[inside].max()
+    channel_difference = np.abs(channel.values - motion)
+    worst = channel_difference[inside].max()
     # Where the motion turns, a reading changes by less than JUMP_COUNTS, and stays.
-    assert worst < 3.0 * count + 0.1 * np.abs(stale(read, samples) - motion)[inside].max()
+    difference = stale(read, samples) - motion
+    largest_difference = np.abs(difference)[inside].max()
+    assert worst < 3.0 * count + 0.1 * largest_difference
 
 
 @given(seed=st.integers(0, 999), count=st.sampled_from([COUNT_RAD, 1e-3, 2.0 * np.pi / 4096]))
@@ -127,11 +130,14 @@ def test_recordings_without_held_readings_are_left_alone(runs: list[Run]) -> Non
 def test_a_fit_of_held_readings_has_the_same_gains_and_says_so(runs: list[Run]) -> None:
     used = [held(run, 3) for run in runs]
     said = [one for one in diagnosed(TRUTH, used) if one.name == "readings-held"]
-    assert [one.runs for one in said] == [
-        (run.name,) for run in runs for _ in ("positions", "currents")
-    ]
+    expected = []
+    for run in runs:
+        for _ in ("positions", "currents"):
+            expected.append((run.name,))
+    assert [one.runs for one in said] == expected
     assert all(one.axes == tuple(AXES) for one in said)
-    gains = identify(TRUTH.model, used, SMALL, axes=AXES).estimate.gains
+    estimate = identify(TRUTH.model, used, SMALL, axes=AXES).estimate
+    gains = estimate.gains
     assert gains == pytest.approx(TRUTH.gains, rel=0.03)
 
 
@@ -143,7 +149,9 @@ def test_positions_of_a_real_arm_that_are_held_for_10_ms_cost_little(shared_data
     """
     recording = tx40(shared_data)
     (run,) = recording.runs
-    stale = replace(run, position_rad=held(run, 50).position_rad)
+    position_rad = held(run, 50).position_rad
+    stale = replace(run, position_rad=position_rad)
     model = model_of(recording.cell)
     found = identify(model, (stale,), recording.cell.conditioning, fixed_gains=recording.gains)
-    assert found.estimate.relative_error(found.system).total < 5.2
+    total = found.estimate.relative_error(found.system).total
+    assert total < 5.2

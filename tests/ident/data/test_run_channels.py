@@ -65,7 +65,8 @@ def test_a_joint_that_never_moves_in_the_only_run_of_a_mounting_is_named(
     used[number] = with_still_joint(used[number])
     with pytest.raises(JointStill) as caught:
         identify(TRUTH.model, used, SMALL, axes=AXES)
-    assert caught.value.subject == f"run r{number}, axis J3"
+    expected = f"run r{number}, axis J3"
+    assert caught.value.subject == expected
     assert caught.value.found == "J3 never moves: the position is constant"
     assert isinstance(caught.value.__cause__, RankDeficient)
 
@@ -82,7 +83,8 @@ def test_an_encoder_that_stands_still_while_its_joint_moves_is_named_and_no_payl
 ) -> None:
     used = [*runs[:3], with_still_joint(runs[3], axis=1)]
     first, *_ = diagnose(identify(TRUTH.model, used, SMALL, axes=AXES), AXES, TRUTH.gains)
-    assert (first.name, first.runs, first.axes) == ("joint-still", ("r3",), ("J2",))
+    expected = ("joint-still", ("r3",), ("J2",))
+    assert (first.name, first.runs, first.axes) == expected
     assert first.found == "J2 never moves: the position is constant"
 
 
@@ -104,29 +106,30 @@ def test_a_constant_current_of_a_motor_that_moves_is_refused(
 
 
 def test_a_constant_current_of_a_held_out_run_is_refused(runs: list[Run]) -> None:
+    holdout = [with_constant_current(runs[3], 1.0)]
     with pytest.raises(CurrentConstant, match="r3"):
-        identify(
-            TRUTH.model, runs[:3], SMALL, holdout=[with_constant_current(runs[3], 1.0)], axes=AXES
-        )
+        identify(TRUTH.model, runs[:3], SMALL, holdout=holdout, axes=AXES)
 
 
 # A clipped current
 
 
 def test_clipped_samples_are_named_and_left_out(runs: list[Run]) -> None:
-    limit = float(np.percentile(np.abs(runs[3].current_a[:, 1]), 80.0))
+    current_a = runs[3].current_a
+    absolute_current_a = np.abs(current_a[:, 1])
+    limit = float(np.percentile(absolute_current_a, 80.0))
     used = [*runs[:3], with_limit(runs[3], limit)]
     (found,) = [one for one in diagnosed(TRUTH, used) if one.name == "current-clipped"]
-    assert (found.runs, found.axes) == (("r3",), ("J2",))
+    expected = (("r3",), ("J2",))
+    assert (found.runs, found.axes) == expected
     assert f"clipped at {limit:.4g}" in found.found
     assert fitted(TRUTH, used) == pytest.approx(TRUTH.gains, rel=0.05)
 
 
 def test_whole_recordings_are_not_clipped(runs: list[Run]) -> None:
     for run in runs:
-        assert not channels_of(
-            TRUTH.model, differentiate(run, TRUTH.model.drive_train, SMALL)
-        ).clipped_percent.any()
+        channels = channels_of(TRUTH.model, differentiate(run, TRUTH.model.drive_train, SMALL))
+        assert not channels.clipped_percent.any()
 
 
 SAMPLES = np.arange(8000) * 0.002
@@ -147,5 +150,7 @@ def test_only_a_limit_is_a_limit(
     current: Callable[[np.ndarray], np.ndarray], request: pytest.FixtureRequest
 ) -> None:
     values = current(SAMPLES)[:, None]
-    found = clipped_samples(values, np.ones_like(values, dtype=np.bool_))
-    assert found.any() == request.node.callspec.id.endswith("limit")
+    usable = np.ones_like(values, dtype=np.bool_)
+    found = clipped_samples(values, usable)
+    expected = request.node.callspec.id.endswith("limit")
+    assert found.any() == expected

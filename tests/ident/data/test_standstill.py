@@ -28,7 +28,8 @@ NEVER = replace(CONDITIONING, standstill_rad_s=(0.0,) * 6)
 
 def _at_rest(run: Run) -> NDArray[np.bool_]:
     """Samples whose exact positions do not change, shape (k, n)."""
-    step = np.abs(np.diff(run.position_rad, axis=0, prepend=run.position_rad[:1]))
+    position_steps_rad = np.diff(run.position_rad, axis=0, prepend=run.position_rad[:1])
+    step = np.abs(position_steps_rad)
     return np.asarray(step < 1e-9)
 
 
@@ -37,11 +38,13 @@ def _sticking(run: Run, truth: Truth, rng: np.random.Generator) -> Run:
     and encoders are noisy.
     """
     at_rest = _at_rest(run)
-    dwell = np.cumsum(np.diff(at_rest, axis=0, prepend=False), axis=0)
+    at_rest_steps = np.diff(at_rest, axis=0, prepend=False)
+    dwell = np.cumsum(at_rest_steps, axis=0)
     names = [column.name for column in truth.model.columns]
-    dry = np.array(
-        [truth.parameters[names.index(f"fs{joint + 1}")] for joint in range(at_rest.shape[1])]
-    )
+    parameters = [
+        truth.parameters[names.index(f"fs{joint + 1}")] for joint in range(at_rest.shape[1])
+    ]
+    dry = np.array(parameters)
     held = np.stack(
         [
             rng.uniform(-1.0, 1.0, dwell[-1, joint] + 1)[dwell[:, joint]]
@@ -51,10 +54,13 @@ def _sticking(run: Run, truth: Truth, rng: np.random.Generator) -> Run:
     )
     torque = np.where(at_rest, dry * held, 0.0)
     noisy = run.position_rad + ENCODER_NOISE_RAD * rng.standard_normal(run.position_rad.shape)
+    to_motor = truth.model.drive_train.to_motor
+    current_a = run.current_a + torque @ to_motor.T / truth.gains
+    position_rad = RESOLUTION_RAD * np.round(noisy / RESOLUTION_RAD)
     return replace(
         run,
-        position_rad=RESOLUTION_RAD * np.round(noisy / RESOLUTION_RAD),
-        current_a=run.current_a + torque @ truth.model.drive_train.to_motor.T / truth.gains,
+        position_rad=position_rad,
+        current_a=current_a,
     )
 
 
@@ -66,7 +72,8 @@ def sticking(truth: Truth, noisy_runs: tuple[Run, ...]) -> tuple[Run, ...]:
 
 def _gain_error(truth: Truth, runs: tuple[Run, ...], conditioning: Conditioning) -> float:
     gains = identify(truth.model, runs, conditioning).estimate.gains
-    return float(np.sqrt(np.mean((gains / truth.gains - 1.0) ** 2)))
+    rms = np.sqrt(np.mean((gains / truth.gains - 1.0) ** 2))
+    return float(rms)
 
 
 def _derived(truth: Truth, run: Run) -> Dataset:
@@ -85,7 +92,8 @@ def test_it_distinguishes_rest_from_motion(
         assert resting.any(axis=0).all()
         assert not data.moving[resting[1:-1]].any()
         speed = np.abs(data.velocity_rad_s)
-        assert data.moving[speed > 0.05 * np.quantile(speed, 0.95, axis=0)].all()
+        speed_quantile = np.quantile(speed, 0.95, axis=0)
+        assert data.moving[speed > 0.05 * speed_quantile].all()
 
 
 def test_gains_are_as_good_as_with_declared_speeds(truth: Truth, sticking: tuple[Run, ...]) -> None:
@@ -125,7 +133,8 @@ def _largest_share_of_rest(truth: Truth, run: Run, conditioning: Conditioning) -
     data = differentiate(run, truth.model.drive_train, conditioning)
     use, _ = row_masks(truth.model, data, conditioning)
     taps = row_filter(data, conditioning)
-    weights = Decimator(np.abs(taps.taps), taps.factor)
+    absolute_tap = np.abs(taps.taps)
+    weights = Decimator(absolute_tap, taps.factor)
     share = weights(_at_rest(run)[1:-1].T.astype(np.float64))
     return float(share[use].max())
 
@@ -135,15 +144,19 @@ def test_a_joint_that_is_held_never_moves(
     truth: Truth, noisy_runs: tuple[Run, ...], noise_rad: float
 ) -> None:
     position = noisy_runs[0].position_rad.copy()
-    position[:, 3] = 0.7 + noise_rad * np.random.default_rng(1).standard_normal(len(position))
+    rng = np.random.default_rng(1)
+    position[:, 3] = 0.7 + noise_rad * rng.standard_normal(len(position))
+    changed_noisy_run = replace(noisy_runs[0], position_rad=position)
     held = [
-        replace(noisy_runs[0], position_rad=position),
+        changed_noisy_run,
         replace(noisy_runs[1], position_rad=position),
     ]
-    assert not _derived(truth, held[0]).moving[:, 3].any()
+    moving = _derived(truth, held[0]).moving
+    assert not moving[:, 3].any()
     with pytest.raises(DataUnfit, match="J4 never moves"):
         identify(truth.model, held, DERIVED)
 
 
 def test_a_zero_speed_is_declared_by_saying_so(truth: Truth, noisy_runs: tuple[Run, ...]) -> None:
-    assert differentiate(noisy_runs[0], truth.model.drive_train, NEVER).moving.all()
+    moving = differentiate(noisy_runs[0], truth.model.drive_train, NEVER).moving
+    assert moving.all()

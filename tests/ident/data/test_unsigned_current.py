@@ -27,14 +27,16 @@ def runs(small_truth: Truth) -> list[Run]:
 def sized(run: Run, axes: list[int], sign: float = 1.0) -> Run:
     """The run with the sizes of these currents alone."""
     current = run.current_a.copy()
-    current[:, axes] = sign * np.abs(current[:, axes])
+    absolute_current = np.abs(current[:, axes])
+    current[:, axes] = sign * absolute_current
     return replace(run, current_a=current)
 
 
 def shifted(current: FloatArray, least: float) -> FloatArray:
     """Currents shifted so far that the least of each is this share of its largest."""
     positive = current - current.min(axis=0)
-    return np.asarray(positive + least * positive.max(axis=0))
+    largest_positive = positive.max(axis=0)
+    return np.asarray(positive + least * largest_positive)
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0], ids=["never negative", "never positive"])
@@ -51,7 +53,8 @@ def test_sizes_are_refused_and_the_axes_named(
 
 
 def test_sizes_in_a_held_out_run_are_refused(small_truth: Truth, runs: list[Run]) -> None:
-    unseen = replace(sized(small_recordings(small_truth, 1, count=1)[0], [1]), name="unseen")
+    run = small_recordings(small_truth, 1, count=1)[0]
+    unseen = replace(sized(run, [1]), name="unseen")
     with pytest.raises(CurrentUnsigned, match="run 'unseen': axis J2"):
         identify(
             small_truth.model,
@@ -65,8 +68,10 @@ def test_sizes_in_a_held_out_run_are_refused(small_truth: Truth, runs: list[Run]
 
 @pytest.mark.parametrize("seed", range(10))
 def test_currents_with_a_sign_are_taken(small_truth: Truth, seed: int) -> None:
-    for run in small_recordings(small_truth, seed, count=2, noise_a=(0.0, 0.02, 0.15)[seed % 3]):
-        assert not unsigned_currents(run, small_truth.model.drive_train.ratio).any()
+    noise_a = (0.0, 0.02, 0.15)[seed % 3]
+    for run in small_recordings(small_truth, seed, count=2, noise_a=noise_a):
+        ratio = small_truth.model.drive_train.ratio
+        assert not unsigned_currents(run, ratio).any()
 
 
 @settings(deadline=None)
@@ -82,44 +87,59 @@ def test_a_current_that_has_one_sign_by_its_nature_is_taken(
         count = current.max(axis=0) / steps
         current = np.rint(current / count) * count
     lifting = replace(runs[0], current_a=current if upwards else -current)
-    assert not unsigned_currents(lifting, small_truth.model.drive_train.ratio).any()
+    ratio = small_truth.model.drive_train.ratio
+    assert not unsigned_currents(lifting, ratio).any()
 
 
 def test_a_brake_that_takes_the_load_at_each_stop_is_no_size(
     small_truth: Truth, runs: list[Run]
 ) -> None:
     """The current of an axis that always lifts is zero while its brake is on."""
-    current = shifted(runs[0].current_a, 0.3)
+    current_a = runs[0].current_a
+    current = shifted(current_a, 0.3)
     stops = np.arange(len(current)) % 220 < 40  # 0.2 s of 1.1
     current[stops] = 0.0
     braked = replace(runs[0], current_a=current)
-    assert not unsigned_currents(braked, small_truth.model.drive_train.ratio).any()
+    ratio = small_truth.model.drive_train.ratio
+    assert not unsigned_currents(braked, ratio).any()
 
 
 def test_an_axis_that_moves_one_way_alone_is_not_judged(
     small_truth: Truth, runs: list[Run]
 ) -> None:
-    turning = replace(runs[0], position_rad=np.cumsum(np.abs(runs[0].position_rad), axis=0))
-    assert not unsigned_currents(sized(turning, [0, 1, 2]), np.eye(3)).any()
-    assert unsigned_currents(sized(runs[0], [0, 1, 2]), small_truth.model.drive_train.ratio).all()
+    absolute_position_rad = np.abs(runs[0].position_rad)
+    position_rad = np.cumsum(absolute_position_rad, axis=0)
+    turning = replace(runs[0], position_rad=position_rad)
+    run = sized(turning, [0, 1, 2])
+    ratio = np.eye(3)
+    assert not unsigned_currents(run, ratio).any()
+    axes = [0, 1, 2]
+    assert unsigned_currents(sized(runs[0], axes), small_truth.model.drive_train.ratio).all()
 
 
 def test_sizes_that_are_reported_slowly_or_coarsely_are_found(
     small_truth: Truth, runs: list[Run]
 ) -> None:
     """A drive reports every third sample anew, in counts of 2 % of the largest current."""
-    slow = np.repeat(np.abs(runs[1].current_a[::3]), 3, axis=0)[: len(runs[1].time_s)]
+    absolute_current_a = np.abs(runs[1].current_a[::3])
+    repeated_current_a = np.repeat(absolute_current_a, 3, axis=0)
+    time_s = runs[1].time_s
+    slow = repeated_current_a[: len(time_s)]
     count = 0.02 * slow.max(axis=0)
-    coarse = replace(runs[1], current_a=np.rint(slow / count) * count)
-    assert unsigned_currents(coarse, small_truth.model.drive_train.ratio).all()
+    current_a = np.rint(slow / count) * count
+    coarse = replace(runs[1], current_a=current_a)
+    ratio = small_truth.model.drive_train.ratio
+    assert unsigned_currents(coarse, ratio).all()
 
 
 def test_samples_that_are_no_use_do_not_hide_a_size(small_truth: Truth, runs: list[Run]) -> None:
     """Where no frame came, the log has an old value or a zero."""
-    size = sized(runs[0], [0, 1, 2])
+    axes = [0, 1, 2]
+    size = sized(runs[0], axes)
     valid = np.ones(size.current_a.shape, dtype=np.bool_)
     valid[100:110] = False
     current = size.current_a.copy()
     current[100:110] = -5.0
     found = replace(size, current_a=current, valid=valid)
-    assert unsigned_currents(found, small_truth.model.drive_train.ratio).all()
+    ratio = small_truth.model.drive_train.ratio
+    assert unsigned_currents(found, ratio).all()

@@ -51,7 +51,8 @@ def test_constants_of_the_normal_distribution_are_those_of_scipy() -> None:
     assert pytest.approx(norm.ppf(0.75), rel=1e-15) == change_module._MEDIAN_OF_NORMAL
     sigmas = [change_significance(0.0, 0.6, x, 0.8, dispersion=1.0) for x in (0.1, 2.0, 30.0)]
     expected_p = 2.0 * norm.sf([0.1, 2.0, 30.0])
-    assert [change.probability for change in sigmas] == pytest.approx(expected_p, rel=1e-12)
+    probabilities = [change.probability for change in sigmas]
+    assert probabilities == pytest.approx(expected_p, rel=1e-12)
 
 
 def test_a_history_is_judged_without_importing_scipy() -> None:
@@ -59,7 +60,8 @@ def test_a_history_is_judged_without_importing_scipy() -> None:
         "import sys, ident.drift.change, ident.drift.change; sys.exit(any(m.startswith('scipy') "
         "for m in sys.modules))"
     )
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+    completed = subprocess.run([sys.executable, "-c", code], check=False)
+    assert completed.returncode == 0
 
 
 def test_a_probability_far_in_the_tail_has_no_digits() -> None:
@@ -83,7 +85,9 @@ def test_a_change_does_not_depend_on_unit_nor_sign(
     old: float, new: float, a: float, b: float, factor: float
 ) -> None:
     one = change_significance(old, a, new, b)
-    other = change_significance(-factor * old, factor * a, -factor * new, factor * b)
+    old_std = factor * a
+    new_std = factor * b
+    other = change_significance(-factor * old, old_std, -factor * new, new_std)
     assert other.percent == pytest.approx(one.percent, rel=1e-9, abs=1e-9)
     assert other.sigmas == pytest.approx(one.sigmas, rel=1e-9, abs=1e-9)
     back = change_significance(new, b, old, a)
@@ -91,9 +95,11 @@ def test_a_change_does_not_depend_on_unit_nor_sign(
 
 
 def test_what_is_known_exactly_changes_surely_or_not_at_all() -> None:
-    assert change_significance(2.0, 0.0, 2.0, 0.0).probability == 1.0
+    probability = change_significance(2.0, 0.0, 2.0, 0.0).probability
+    assert probability == 1.0
     assert change_significance(2.0, 0.0, 2.1, 0.0).probability == 0.0
-    assert change_significance(0.0, 0.0, 1.0, 0.1).percent == math.inf
+    percent = change_significance(0.0, 0.0, 1.0, 0.1).percent
+    assert percent == math.inf
     for wrong in ((math.nan, 0.1, 1.0, 0.1), (1.0, -0.1, 1.0, 0.1), (1.0, 0.1, math.inf, 0.1)):
         with pytest.raises(ValueError, match="expected finite"):
             change_significance(*wrong)
@@ -126,7 +132,8 @@ def test_a_recalibration_without_change_is_seldom_taken_for_one(common: float) -
     found = []
     for _ in range(1500):
         old, new = (GAINS + DISPERSION * std * (root @ rng.standard_normal(AXES)) for _ in range(2))
-        found.append(decide(NAMES, old, std, new, std).differs)
+        differs = decide(NAMES, old, std, new, std).differs
+        found.append(differs)
     # 1 % asked for; 1500 draws know it to 0.26 %.
     assert np.mean(found) < 0.02
 
@@ -137,7 +144,8 @@ def test_a_recalibration_with_a_change_says_which_and_how_much() -> None:
     new[3] *= 0.94
     found = decide(NAMES, GAINS, std, new, std)
     assert found.differs
-    assert found.changes[3].percent == pytest.approx(-6.0)
+    percent = found.changes[3].percent
+    assert percent == pytest.approx(-6.0)
     assert found.adjusted[3] == min(found.adjusted) < 1e-6
     assert found.words.startswith("changed by more than noise: J4 -6 % (10.")
     assert "J3" not in found.words
@@ -147,7 +155,8 @@ def test_a_recalibration_with_a_change_says_which_and_how_much() -> None:
 
 
 def test_nothing_to_compare_changes_nothing() -> None:
-    assert not decide((), [], [], [], []).differs
+    differs = decide((), [], [], [], []).differs
+    assert not differs
 
 
 @settings(max_examples=50, deadline=None)
@@ -206,12 +215,15 @@ def test_scatter_is_known_better_than_by_the_median() -> None:
     rng = np.random.default_rng(11)
     values, stds = draw(rng, (300, 1, 1001), 1.5)
     away = np.abs(np.diff(values)) / np.hypot(stds[..., 1:], stds[..., :-1])
-    by_median = np.median(away, axis=-1) / norm.ppf(0.75)
+    median_away = np.median(away, axis=-1)
+    by_median = median_away / norm.ppf(0.75)
     assert np.std(dispersions(values, stds)) < 0.85 * np.std(by_median)
 
 
 def test_few_calibrations_say_nothing_of_scatter() -> None:
-    np.testing.assert_array_equal(dispersions(np.ones((2, 3)), np.ones((2, 3))), [DISPERSION] * 2)
+    stds = np.ones((2, 3))
+    expected = [DISPERSION] * 2
+    np.testing.assert_array_equal(dispersions(np.ones((2, 3)), stds), expected)
 
 
 def test_the_sums_are_pages() -> None:
@@ -219,8 +231,10 @@ def test_the_sums_are_pages() -> None:
     values = np.array([0.0, 2.0, 2.0, -3.0]) + 100.0
     stds = np.ones(4)
     stds[0] = 1e-9
-    found = cusum_paths(values, stds, 1.0, Chart(reference=0.5, baseline=1))
-    np.testing.assert_allclose(found[0], [0.0, 2.0, 2.0, -3.0])
+    chart = Chart(reference=0.5, baseline=1)
+    found = cusum_paths(values, stds, 1.0, chart)
+    expected = [0.0, 2.0, 2.0, -3.0]
+    np.testing.assert_allclose(found[0], expected)
     np.testing.assert_allclose(found[1], [0.0, 1.5, 3.0, 0.0])
     np.testing.assert_allclose(found[2], [0.0, 0.0, 0.0, 2.5])
 
@@ -231,15 +245,20 @@ def test_deviations_within_the_baseline_are_independent_and_normal() -> None:
     """
     rng = np.random.default_rng(5)
     values = rng.standard_normal((20_000, CHART.baseline))
-    deviations = cusum_paths(values, np.ones_like(values), 1.0, CHART)[0][:, 1:]
-    assert kstest(deviations.ravel(), "norm").pvalue > 0.01
+    stds = np.ones_like(values)
+    deviations = cusum_paths(values, stds, 1.0, CHART)[0][:, 1:]
+    pvalue = kstest(deviations.ravel(), "norm").pvalue
+    assert pvalue > 0.01
     correlation = np.corrcoef(deviations.T)
-    assert np.abs(correlation - np.eye(CHART.baseline - 1)).max() < 0.03
+    identity = np.eye(CHART.baseline - 1)
+    correlation_difference = correlation - identity
+    assert np.abs(correlation_difference).max() < 0.03
 
 
 def test_a_step_is_reported_with_its_size_its_time_and_its_side() -> None:
     values = np.r_[np.full(14, -10.0), np.full(6, -9.4)]
-    found = cusum(values, np.full(20, 0.04))
+    stds = np.full(20, 0.04)
+    found = cusum(values, stds)
     assert found.alarmed
     assert found.onset == 13
     assert not found.alarms[-1].rose
@@ -256,7 +275,8 @@ def test_a_step_is_reported_with_its_size_its_time_and_its_side() -> None:
 def test_a_step_has_its_whole_size_from_the_first_day_on(count: int, newest: int) -> None:
     """Calibrations before the onset are no part of the change after it."""
     values = np.r_[np.full(14, 10.0), np.full(count - 14, 9.4)]
-    found = cusum(values, np.full(count, 0.04))
+    stds = np.full(count, 0.04)
+    found = cusum(values, stds)
     assert found.alarmed
     assert found.onset == 13
     assert found.change_percent == pytest.approx(-6.0)
@@ -267,7 +287,8 @@ def test_a_step_has_its_whole_size_from_the_first_day_on(count: int, newest: int
 
 def test_a_change_within_the_baseline_is_compared_with_what_was_before() -> None:
     values = np.r_[np.full(5, 10.0), np.full(4, 10.6)]
-    found = cusum(values, np.full(9, 0.04))
+    stds = np.full(9, 0.04)
+    found = cusum(values, stds)
     assert found.onset == 4
     assert found.change_percent == pytest.approx(6.0)
     assert found.alarms[-1].rose
@@ -276,12 +297,14 @@ def test_a_change_within_the_baseline_is_compared_with_what_was_before() -> None
 def test_one_calibration_far_off_is_a_jump() -> None:
     values = np.full(15, 10.0)
     values[14] = 10.0 + 0.04 * DISPERSION * 5.8
-    found = cusum(values, np.full(15, 0.04))
+    stds = np.full(15, 0.04)
+    found = cusum(values, stds)
     assert [alarm.kind for alarm in found.alarms] == [AlarmKind.JUMP]
     calm = cusum(np.r_[values, 10.0, 10.0], np.full(17, 0.04))
     assert calm.alarms == found.alarms
     assert not calm.alarmed
-    assert (found.alarm, calm.alarm) == (found.alarms[0], None)
+    expected = (found.alarms[0], None)
+    assert (found.alarm, calm.alarm) == expected
 
 
 def test_an_alarm_that_has_passed_changes_nothing_of_what_is_reported() -> None:
@@ -290,10 +313,13 @@ def test_an_alarm_that_has_passed_changes_nothing_of_what_is_reported() -> None:
     """
     values = np.full(20, 10.0)
     values[3] = 10.0 + 0.04 * DISPERSION * 6.5
-    assert cusum(values[:4], np.full(4, 0.04)).onset == 2
+    stds = np.full(4, 0.04)
+    onset = cusum(values[:4], stds).onset
+    assert onset == 2
     found = cusum(values, np.full(20, 0.04))
     assert [alarm.index for alarm in found.alarms] == [3]
-    assert (found.alarmed, found.alarm, found.onset, found.steady) == (False, None, None, False)
+    expected = (False, None, None, False)
+    assert (found.alarmed, found.alarm, found.onset, found.steady) == expected
     assert found.baseline == pytest.approx(values[:12].mean())
     assert found.baseline_std == pytest.approx(DISPERSION * 0.04 / math.sqrt(12))
     assert found.change_percent == pytest.approx(100.0 * (10.0 / values[:12].mean() - 1.0))
@@ -302,10 +328,13 @@ def test_an_alarm_that_has_passed_changes_nothing_of_what_is_reported() -> None:
 def test_a_slope_that_has_ended_is_not_reported_along_its_line() -> None:
     """It rises by 0.7 σ a calibration for eight of them, and is back where it was."""
     values = 10.0 * (1.0 + 0.0028 * np.r_[np.arange(8), np.zeros(8)])
-    assert cusum(values[:8], np.full(8, 0.04)).steady
+    stds = np.full(8, 0.04)
+    assert cusum(values[:8], stds).steady
     found = cusum(values, np.full(16, 0.04))
-    assert found.alarms[-1].kind is AlarmKind.TREND
-    assert (found.alarmed, found.alarm, found.onset, found.steady) == (False, None, None, False)
+    last_alarm = found.alarms[-1]
+    assert last_alarm.kind is AlarmKind.TREND
+    expected = (False, None, None, False)
+    assert (found.alarmed, found.alarm, found.onset, found.steady) == expected
     assert found.baseline == pytest.approx(values[:12].mean())
     assert found.change_percent == pytest.approx(100.0 * (10.0 / values[:12].mean() - 1.0))
 
@@ -313,18 +342,19 @@ def test_a_slope_that_has_ended_is_not_reported_along_its_line() -> None:
 @settings(max_examples=100, deadline=None)
 @given(st.lists(st.sampled_from([10.0, 10.0, 10.05, 9.95, 10.6, 9.4]), min_size=2, max_size=30))
 def test_an_onset_is_reported_in_alarm_only(values: list[float]) -> None:
-    found = cusum(values, np.full(len(values), 0.04))
+    stds = np.full(len(values), 0.04)
+    found = cusum(values, stds)
     assert found.alarmed == (found.onset is not None) == (found.alarm is not None)
     if not found.alarmed:
         assert not found.steady
-        assert found.baseline == pytest.approx(
-            np.mean(values[: min(len(values) - 1, CHART.baseline)])
-        )
+        smallest = min(len(values) - 1, CHART.baseline)
+        assert found.baseline == pytest.approx(np.mean(values[:smallest]))
 
 
 def test_one_calibration_is_its_own_baseline() -> None:
     found = cusum([5.0], [0.1])
-    assert (found.baseline, found.alarms, found.onset, found.change_percent) == (5.0, (), None, 0.0)
+    expected = (5.0, (), None, 0.0)
+    assert (found.baseline, found.alarms, found.onset, found.change_percent) == expected
 
 
 @pytest.mark.parametrize(
@@ -358,7 +388,8 @@ def test_numbers_of_any_size_are_watched(values: list[float], stds: list[float])
     assert all(
         map(math.isfinite, [*numbers, *found.deviations, *found.upper, *found.lower, *found.trend])
     )
-    assert len(decide(("J1",), values[:1], stds[:1], values[1:2], stds[1:2]).words) < 120
+    words = decide(("J1",), values[:1], stds[:1], values[1:2], stds[1:2]).words
+    assert len(words) < 120
 
 
 def test_one_sigma_of_any_size_leaves_the_others_their_say() -> None:
@@ -385,7 +416,8 @@ def test_a_drift_does_not_depend_on_unit_nor_sign(
     np.testing.assert_allclose(other.upper, one.upper, atol=1e-6)
     np.testing.assert_allclose(other.lower, one.lower, atol=1e-6)
     np.testing.assert_allclose(other.trend, one.trend, atol=1e-6)
-    assert [alarm.kind for alarm in other.alarms] == [alarm.kind for alarm in one.alarms]
+    expected = [alarm.kind for alarm in one.alarms]
+    assert [alarm.kind for alarm in other.alarms] == expected
     assert other.change_percent == pytest.approx(one.change_percent, abs=1e-6)
 
 
@@ -394,10 +426,12 @@ def test_a_slope_is_reported_along_its_line() -> None:
     the CUSUM's baseline goes with it, the line does not.
     """
     values = -10.0 * (1.0 - 0.0028 * np.arange(8))
-    found = cusum(values, np.full(8, 0.04))
+    stds = np.full(8, 0.04)
+    found = cusum(values, stds)
     assert found.steady
     assert found.alarmed
-    assert found.alarms[-1] == Alarm(7, AlarmKind.TREND, rose=False)
+    expected = Alarm(7, AlarmKind.TREND, rose=False)
+    assert found.alarms[-1] == expected
     assert found.onset == 0
     assert found.baseline == pytest.approx(-10.0)
     assert found.change_percent == pytest.approx(-1.96)
@@ -433,7 +467,8 @@ def test_three_per_cent_over_twelve_recalibrations_is_found_by_the_sums(
     """Shares of histories in which it is found at most two, and four,
     recalibrations after it has reached 3 σ [%].
     """
-    found = delays(np.random.default_rng(8), 800, std_percent=std_percent, before=12)
+    rng = np.random.default_rng(8)
+    found = delays(rng, 800, std_percent=std_percent, before=12)
     assert share_percent(found.cusum, 2) >= within_two
     assert share_percent(found.cusum, 4) >= within_four
     assert (found.any <= found.cusum).all()
@@ -448,7 +483,8 @@ def test_a_drift_from_the_first_day_is_found_by_the_line_sooner_than_by_the_sums
     """No test can find them all: what the best one finds that knows the day is no more than
     `most_percent`.
     """
-    found = delays(np.random.default_rng(9), 800, std_percent=std_percent, before=1)
+    rng = np.random.default_rng(9)
+    found = delays(rng, 800, std_percent=std_percent, before=1)
     share = share_percent(found.any, 2)
     assert share >= within_two
     assert share > share_percent(found.cusum, 2) + 10
@@ -458,7 +494,9 @@ def test_a_drift_from_the_first_day_is_found_by_the_line_sooner_than_by_the_sums
 def test_patterns() -> None:
     std = np.full(6, 0.4)
     one = np.array([0.1, -0.2, 0.3, -6.0, 0.2, 0.0])
-    assert pattern(np.zeros(6), std, [False] * 6) is Pattern.NONE
+    alarmed = [False] * 6
+    change_percent = np.zeros(6)
+    assert pattern(change_percent, std, alarmed) is Pattern.NONE
     assert pattern(one, std, [False, False, False, True, False, False]) is Pattern.ONE
     several = np.array([0.1, -5.0, 0.3, -6.0, 0.2, 0.0])
     assert pattern(several, std, np.abs(several) > 4) is Pattern.SEVERAL

@@ -22,7 +22,8 @@ def _t(values: NDArray[np.float64], stds: NDArray[np.float64]) -> float:
     """By numpy's own weighted fit."""
     slope = np.polyfit(np.arange(len(values)), values, 1, w=1.0 / stds)[0]
     covariance = np.polyfit(np.arange(len(values)), values, 1, w=1.0 / stds, cov="unscaled")[1]
-    return float(slope / np.sqrt(covariance[0, 0]))
+    covariance_root = np.sqrt(covariance[0, 0])
+    return float(slope / covariance_root)
 
 
 @settings(max_examples=100, deadline=None)
@@ -63,7 +64,8 @@ def test_without_drift_t_is_standard_normal_for_every_number_of_calibrations() -
     stds = 10.0 ** rng.uniform(-1.0, 0.0, (20_000, 24))
     found = trend_statistic(7.0 + 1.2 * stds * rng.standard_normal(stds.shape), stds, 1.2)
     for count in (FEWEST, 6, 12, 24):
-        assert kstest(found[:, count - 1], "norm").pvalue > 0.01
+        pvalue = kstest(found[:, count - 1], "norm").pvalue
+        assert pvalue > 0.01
 
 
 def test_with_drift_t_is_normal_about_what_the_slope_says() -> None:
@@ -72,10 +74,12 @@ def test_with_drift_t_is_normal_about_what_the_slope_says() -> None:
     slope = 0.4
     dispersion = 1.05
     values = slope * np.arange(12) + dispersion * rng.standard_normal((20_000, 12))
-    found = trend_statistic(values, np.ones_like(values), dispersion)
+    stds = np.ones_like(values)
+    found = trend_statistic(values, stds, dispersion)
     for count in (FEWEST, 8, 12):
         expected = slope / dispersion * np.sqrt(count * (count**2 - 1) / 12.0)
-        assert kstest(found[:, count - 1] - expected, "norm").pvalue > 0.01
+        difference = found[:, count - 1] - expected
+        assert kstest(difference, "norm").pvalue > 0.01
 
 
 def test_one_sigma_far_below_the_others_costs_no_digits() -> None:
@@ -96,6 +100,6 @@ def test_several_gains_at_once_are_each_by_itself() -> None:
     factors = rng.uniform(1.0, 2.0, (2, 3))
     together = trend_statistic(values, stds, factors)
     for index in np.ndindex(2, 3):
-        np.testing.assert_allclose(
-            together[index], trend_statistic(values[index], stds[index], float(factors[index]))
-        )
+        dispersion = float(factors[index])
+        expected = trend_statistic(values[index], stds[index], dispersion)
+        np.testing.assert_allclose(together[index], expected)

@@ -33,12 +33,15 @@ _speeds = arrays(
 def test_splines_sum_to_one_and_are_never_negative(
     x: FloatArray, lower: float, width: float
 ) -> None:
-    basis = cubic_basis(x, lower, lower + width)
-    assert basis.shape == (INTERVALS + 3, len(x))
+    upper = lower + width
+    basis = cubic_basis(x, lower, upper)
+    expected = (INTERVALS + 3, len(x))
+    assert basis.shape == expected
     assert basis.sum(axis=0) == pytest.approx(np.ones(len(x)))
     assert np.all(basis >= -1e-15)
+    lower_upper = lower + width
     outside = cubic_basis(
-        np.array([lower - 1.0, lower, lower + width, lower + width + 1.0]), lower, lower + width
+        np.array([lower - 1.0, lower, lower + width, lower + width + 1.0]), lower, lower_upper
     )
     assert outside[:, 0] == pytest.approx(outside[:, 1])
     assert outside[:, 2] == pytest.approx(outside[:, 3])
@@ -63,9 +66,11 @@ def test_the_way_grows_until_the_motion_turns(velocity: FloatArray) -> None:
     assert np.all(way >= 0.0)
     assert np.all(np.diff(way)[~turned] >= -1e-12)
     assert way[1:][turned] == pytest.approx(0.0, abs=1e-12)
-    assert set(np.unique(direction)) <= {-1.0, 0.0, 1.0}
+    unique_directions = set(np.unique(direction))
+    assert unique_directions <= {-1.0, 0.0, 1.0}
     moving = np.abs(velocity) > STICKING_RAD_S
-    assert np.array_equal(direction[moving], np.sign(velocity[moving]))
+    velocity_sign = np.sign(velocity[moving])
+    assert np.array_equal(direction[moving], velocity_sign)
     # Who has moved once has a direction, and keeps it at rest.
     assert np.all(direction[np.argmax(moving) :] != 0.0) or not moving.any()
 

@@ -42,42 +42,56 @@ def random_signals(seed: int) -> Signals:
     position, velocity, acceleration, load, motor, geared = rng.normal(size=(6, JOINTS, SAMPLES))
     torque = np.cumsum(motor, axis=1)
     time_s = np.arange(SAMPLES) / 100.0
+    inertia_kg_m2 = rng.normal(size=(JOINTS, JOINTS, SAMPLES))
+    temperature_c = 45.0 + 5.0 * rng.normal(size=(JOINTS, SAMPLES))
+    session_s = 5.0 + time_s
+    position_rad = 2.0 * position
+    motor_position_rad = 30.0 * position
+    current_a = torque / 20.0
     return Signals(
         rate_hz=100.0,
         time_s=time_s,
-        session_s=5.0 + time_s,
-        position_rad=2.0 * position,
+        session_s=session_s,
+        position_rad=position_rad,
         velocity_rad_s=velocity,
         acceleration_rad_s2=acceleration,
-        motor_position_rad=30.0 * position,
-        inertia_kg_m2=rng.normal(size=(JOINTS, JOINTS, SAMPLES)),
+        motor_position_rad=motor_position_rad,
+        inertia_kg_m2=inertia_kg_m2,
         load_torque_nm=load,
         geared_torque_nm=geared,
         motor_torque_nm=torque,
-        current_a=torque / 20.0,
-        temperature_c=45.0 + 5.0 * rng.normal(size=(JOINTS, SAMPLES)),
+        current_a=current_a,
+        temperature_c=temperature_c,
     )
 
 
 def _scaled(s: Signals, factor: float) -> Signals:
+    time_s = factor * s.time_s
+    session_s = factor * s.session_s
+    position_rad = factor * s.position_rad
+    velocity_rad_s = factor * s.velocity_rad_s
+    motor_position_rad = factor * s.motor_position_rad
+    load_torque_nm = factor * s.load_torque_nm
+    motor_torque_nm = factor * s.motor_torque_nm
+    current_a = factor * s.current_a
     return replace(
         s,
-        time_s=factor * s.time_s,
-        session_s=factor * s.session_s,
-        position_rad=factor * s.position_rad,
-        velocity_rad_s=factor * s.velocity_rad_s,
-        motor_position_rad=factor * s.motor_position_rad,
-        load_torque_nm=factor * s.load_torque_nm,
-        motor_torque_nm=factor * s.motor_torque_nm,
-        current_a=factor * s.current_a,
+        time_s=time_s,
+        session_s=session_s,
+        position_rad=position_rad,
+        velocity_rad_s=velocity_rad_s,
+        motor_position_rad=motor_position_rad,
+        load_torque_nm=load_torque_nm,
+        motor_torque_nm=motor_torque_nm,
+        current_a=current_a,
     )
 
 
 def _over_its_range(variable: Abscissa, signed: int, other_axis: int = 0) -> Smooth:
     x = np.abs(random_signals(5).variable(variable, 0, other_axis - 1 if other_axis else None))
-    return Smooth(
-        variable, float(np.quantile(x, 0.05)), float(np.quantile(x, 0.95)), signed, other_axis
-    )
+    lower = float(np.quantile(x, 0.05))
+    upper = float(np.quantile(x, 0.95))
+    return Smooth(variable, lower, upper, signed, other_axis)
 
 
 GENERIC: tuple[tuple[Effect, ...], ...] = (
@@ -112,7 +126,9 @@ def _is_zero_where(
     """
     free = columns(signals)
     middle = columns(held)[..., SAMPLES // 2 - 5 : SAMPLES // 2 + 5]
-    return bool(np.max(np.abs(middle)) <= 1e-7 * np.max(np.abs(free))) and bool(np.any(free))
+    largest_absolute_middle = np.max(np.abs(middle))
+    largest_absolute_free = np.max(np.abs(free))
+    return bool(largest_absolute_middle <= 1e-7 * largest_absolute_free) and bool(np.any(free))
 
 
 def _held(value: FloatArray) -> FloatArray:
@@ -202,8 +218,10 @@ def test_every_property_can_be_refuted_and_is_claimed_by_someone() -> None:
     # Corrections of the geometry are tested against an arm (test_geometry.py); these signals have
     # none.
     of_signals = set(Property) - {Property.TURNS_THE_ARM}
-    assert {claim for _, claim in WRONG} == of_signals
-    assert {effect.declares for family in (*EFFECTS, *GENERIC) for effect in family} == of_signals
+    claims = {claim for _, claim in WRONG}
+    assert claims == of_signals
+    declares = {effect.declares for family in (*EFFECTS, *GENERIC) for effect in family}
+    assert declares == of_signals
     assert {effect.declares for family in GEOMETRY for effect in family} == {Property.TURNS_THE_ARM}
 
 
@@ -217,7 +235,8 @@ def test_columns_are_as_many_as_coefficients_and_belong_to_their_axes(effect: Ef
         GearSide.ALL_JOINTS: (JOINTS,),
         GearSide.ALL_MOTORS: (JOINTS,),
     }.get(effect.side, ())
-    assert columns.shape == (*joints, len(effect.coefficients), SAMPLES)
+    expected = (*joints, len(effect.coefficients), SAMPLES)
+    assert columns.shape == expected
     assert np.all(np.isfinite(columns))
     constant = np.array(
         [
@@ -225,7 +244,8 @@ def test_columns_are_as_many_as_coefficients_and_belong_to_their_axes(effect: Ef
             for column in effect.coefficients
         ]
     )
-    moving = np.ptp(columns, axis=-1) > 0
+    columns_range = np.ptp(columns, axis=-1)
+    moving = columns_range > 0
     if effect.name == "cable":  # each stiffness of one joint alone acts on that joint
         moving = moving.any(axis=0)
     assert np.all(moving | constant)
@@ -240,7 +260,8 @@ def test_columns_are_as_many_as_coefficients_and_belong_to_their_axes(effect: Ef
         return replace(signals, **arrays)
 
     if effect.settings.get("other_axis"):
-        own = [0, int(effect.settings["other_axis"]) - 1]
+        other_axis = int(effect.settings["other_axis"])
+        own = [0, other_axis - 1]
     else:
         own = [0]
     if effect.side is GearSide.ALL_MOTORS:
@@ -272,7 +293,8 @@ def test_columns_act_where_the_effect_says() -> None:
     assert at_joints(Spring(), 1, one, train) == pytest.approx(
         np.stack((0.0 * one, one, 0.0 * one))
     )
-    assert at_joints(Coupling(3, 1), 0, two, train) == pytest.approx(
+    coupling = Coupling(3, 1)
+    assert at_joints(coupling, 0, two, train) == pytest.approx(
         np.stack((two[0], 0.0 * one, two[1]))
     )
     assert np.array_equal(at_joints(Elasticity(), 1, all_, train), all_)
@@ -285,7 +307,8 @@ def test_a_pair_is_named_by_its_lower_axis_and_only_angles_have_a_sine() -> None
     gantry = robot_from_urdf(GANTRY.urdf)
     placed = [axis for axis in range(3) if is_placeable(Coupling(3, 1), axis, three)]
     assert placed == [0, 1]
-    assert not is_placeable(Coupling(4, 1), 0, three)
+    coupling = Coupling(4, 1)
+    assert not is_placeable(coupling, 0, three)
     assert is_placeable(Spring(), 2, three)
     # What all motors share is tried once.
     assert [axis for axis in range(3) if is_placeable(TimeSkew(), axis, three)] == [0]
@@ -315,10 +338,13 @@ def _duplicates(families: tuple[tuple[Effect, ...], ...]) -> list[tuple[str, str
     """Pairs of effects of which one's columns span the other's on the robot's joints:
     they cannot be distinguished.
     """
-    train = DriveTrain(np.diag(np.linspace(30.0, 50.0, JOINTS)))
+    grid = np.linspace(30.0, 50.0, JOINTS)
+    ratio = np.diag(grid)
+    train = DriveTrain(ratio)
     first_run = random_signals(5)
     rest = random_signals(6)
-    runs = (first_run, replace(rest, session_s=300.0 + rest.time_s))
+    session_s = 300.0 + rest.time_s
+    runs = (first_run, replace(rest, session_s=session_s))
     spans: list[tuple[str, FloatArray, bool]] = []
     for effect in (effect for family in families for effect in family):
         torque = np.concatenate(
@@ -348,7 +374,8 @@ def test_no_two_effects_are_the_same_under_two_names() -> None:
     forms = [("saturation (0)", "saturation (1)")]  # with one term and with two
     assert _duplicates(EFFECTS) == [*of_one_joint, *forms]
     same = [("nonlinear-viscous (3)", "cubic ()")]
-    assert _duplicates((*EFFECTS, (Cubic(),))) == [*same, *of_one_joint, *forms]
+    families = (*EFFECTS, (Cubic(),))
+    assert _duplicates(families) == [*same, *of_one_joint, *forms]
 
 
 @pytest.mark.parametrize("backwards", [0, 1])
@@ -357,7 +384,8 @@ def test_the_rate_behind_a_filter_is_that_of_its_equation(backwards: int) -> Non
     rate_hz = 500.0
     filter_s = 0.012
     start = 100
-    time_s = (np.arange(300) - start) / rate_hz
+    difference = np.arange(300) - start
+    time_s = difference / rate_hz
     ramp = np.maximum(time_s, 0.0)
     rate = np.where(time_s > 0.0, -np.expm1(-time_s / filter_s), 0.0)
     if backwards:
@@ -365,16 +393,17 @@ def test_the_rate_behind_a_filter_is_that_of_its_equation(backwards: int) -> Non
         rate = -rate[::-1]
     effect = Lag(filter_s, backwards)
     signals = replace(random_signals(1), rate_hz=rate_hz)
-    found = effect.columns(replace(signals, motor_torque_nm=np.stack((ramp, np.full(300, 7.0)))), 0)
+    motor_torque_nm = np.stack((ramp, np.full(300, 7.0)))
+    found = effect.columns(replace(signals, motor_torque_nm=motor_torque_nm), 0)
     assert found[0] == pytest.approx(-rate, abs=1e-9)
-    assert effect.columns(
-        replace(signals, motor_torque_nm=np.full((1, 300), 7.0)), 0
-    ) == pytest.approx(0.0, abs=1e-9)
+    changed_signal = replace(signals, motor_torque_nm=np.full((1, 300), 7.0))
+    assert effect.columns(changed_signal, 0) == pytest.approx(0.0, abs=1e-9)
 
 
 def test_with_no_filter_it_is_the_central_difference() -> None:
     signals = random_signals(1)
-    slope = np.gradient(signals.motor_torque_nm[2]) * signals.rate_hz
+    motor_torque_nm_gradient = np.gradient(signals.motor_torque_nm[2])
+    slope = motor_torque_nm_gradient * signals.rate_hz
     assert Lag().columns(signals, 2)[0] == pytest.approx(-slope)
     assert TimeSkew().columns(signals, 0)[2, 0] == pytest.approx(-slope)
 
@@ -389,20 +418,31 @@ def test_the_rest_of_a_rotor_is_the_derivative_of_a_loss(effect: LoadFriction | 
     axis = 2
     step = 1e-7
     loss, rest = effect.columns(s, axis)
-    (before,) = replace(effect, rotor_inertia_kg_m2=0.4 - step, with_rotor=0).columns(s, axis)
-    (after,) = replace(effect, rotor_inertia_kg_m2=0.4 + step, with_rotor=0).columns(s, axis)
+    rotor_inertia_kg_m2 = 0.4 - step
+    (before,) = replace(effect, rotor_inertia_kg_m2=rotor_inertia_kg_m2, with_rotor=0).columns(
+        s, axis
+    )
+    step_rotor_inertia_kg_m2 = 0.4 + step
+    (after,) = replace(effect, rotor_inertia_kg_m2=step_rotor_inertia_kg_m2, with_rotor=0).columns(
+        s, axis
+    )
     np.testing.assert_allclose(rest, (after - before) / (2.0 * step), atol=1e-6)
-    bare = replace(s, load_torque_nm=s.load_torque_nm - 0.4 * s.acceleration_rad_s2)
-    geared = replace(bare, geared_torque_nm=s.geared_torque_nm - 0.4 * s.acceleration_rad_s2)
-    (expected,) = replace(effect, rotor_inertia_kg_m2=0.0, with_rotor=0).columns(geared, axis)
+    load_torque_nm = s.load_torque_nm - 0.4 * s.acceleration_rad_s2
+    bare = replace(s, load_torque_nm=load_torque_nm)
+    geared_torque_nm = s.geared_torque_nm - 0.4 * s.acceleration_rad_s2
+    geared = replace(bare, geared_torque_nm=geared_torque_nm)
+    changed_effect = replace(effect, rotor_inertia_kg_m2=0.0, with_rotor=0)
+    (expected,) = changed_effect.columns(geared, axis)
     np.testing.assert_allclose(loss, expected, atol=1e-12)
 
 
 def test_effects_behind_the_gear_leave_a_known_rotor_out() -> None:
     s = random_signals(4)
     axis = 2
-    loss = PlacedEffect(LoadFriction(0, 0.3, 1), axis)
-    known = beside_rotors(s, (PlacedEffect(Elasticity(), 1), loss))
+    load_friction = LoadFriction(0, 0.3, 1)
+    loss = PlacedEffect(load_friction, axis)
+    effects = (PlacedEffect(Elasticity(), 1), loss)
+    known = beside_rotors(s, effects)
     turning_nm = 0.3 * s.acceleration_rad_s2[axis]
     np.testing.assert_allclose(known.link_torque(axis), s.load_torque_nm[axis] - turning_nm)
     np.testing.assert_allclose(known.gear_torque(axis), s.geared_torque_nm[axis] - turning_nm)
@@ -418,4 +458,5 @@ def test_effects_behind_the_gear_leave_a_known_rotor_out() -> None:
     np.testing.assert_array_equal(known.inertia(slice(None), 1), s.inertia(slice(None), 1))
     np.testing.assert_array_equal(loss.effect.columns(known, axis), loss.effect.columns(s, axis))
     assert not np.allclose(Elasticity().columns(known, axis), Elasticity().columns(s, axis))
-    assert beside_rotors(s, (PlacedEffect(LoadFriction(0), axis),)) is s
+    placed_effect = PlacedEffect(LoadFriction(0), axis)
+    assert beside_rotors(s, (placed_effect,)) is s

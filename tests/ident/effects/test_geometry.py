@@ -41,7 +41,8 @@ STEP = 1e-4
 
 def _run() -> Dataset:
     truth = tx40_truth()
-    run = record(truth, "bare", np.random.default_rng(4), seconds=4.0)
+    rng = np.random.default_rng(4)
+    run = record(truth, "bare", rng, seconds=4.0)
     return differentiate(run, truth.model.drive_train, SMOOTH)
 
 
@@ -80,21 +81,23 @@ def test_a_column_is_the_change_of_the_torque_of_a_corrected_arm(
         values = list(effect.applied)
         values[coefficient] += change
         placed = (PlacedEffect(effect.with_applied(values), axis),)
-        return _smooth_torque(
-            corrected_model(truth.model, placed), corrected_dataset(data, placed), truth.parameters
-        )
+        model = corrected_model(truth.model, placed)
+        return _smooth_torque(model, corrected_dataset(data, placed), truth.parameters)
 
-    expected = (torque(step) - torque(-step)) / (2.0 * step)
+    difference = torque(step) - torque(-step)
+    expected = difference / (2.0 * step)
     around = (PlacedEffect(effect, axis),)
     signals = declared_signals(
         corrected_model(truth.model, around), data, truth.parameters, truth.gains
     )
     found = effect.columns(signals, axis)[:, coefficient]
     inner = slice(20, -20)  # the ends of a run that was shifted stay constant
-    size = float(np.max(np.abs(expected)))
+    largest_absolute_expected = np.max(np.abs(expected))
+    size = float(largest_absolute_expected)
     tolerance = 2e-2 if isinstance(effect, LatePosition) else 1e-4
     assert size > 0.0
-    assert np.max(np.abs(found - expected)[:, inner]) < tolerance * size
+    largest_difference = np.max(np.abs(found - expected)[:, inner])
+    assert largest_difference < tolerance * size
 
 
 def test_the_zero_of_an_axis_along_gravity_changes_no_torque() -> None:
@@ -107,10 +110,13 @@ def test_the_zero_of_an_axis_along_gravity_changes_no_torque() -> None:
 
 def test_a_corrected_zero_moves_the_arm_as_the_offset_does() -> None:
     truth = tx40_truth()
-    position = np.random.default_rng(1).uniform(-1.0, 1.0, (5, 6))
+    rng = np.random.default_rng(1)
+    position = rng.uniform(-1.0, 1.0, (5, 6))
     turned = position.copy()
     turned[:, 3] += 0.1
-    model = corrected_model(truth.model, (PlacedEffect(ZeroOffset(applied_rad=0.1), 3),))
+    effect = ZeroOffset(applied_rad=0.1)
+    effects = (PlacedEffect(effect, 3),)
+    model = corrected_model(truth.model, effects)
     found = poses(model.robot, position)
     expected = poses(truth.model.robot, turned)
     # Behind the joint; the joint's own frame turns with it in both.
@@ -126,16 +132,19 @@ def test_a_corrected_zero_moves_the_arm_as_the_offset_does() -> None:
 def test_gravity_keeps_its_length_and_is_found_again(
     direction: tuple[float, float, float], turn: tuple[float, float]
 ) -> None:
-    declared = 9.81 * np.array(direction) / np.linalg.norm(direction)
+    direction_norm = np.linalg.norm(direction)
+    declared = 9.81 * np.array(direction) / direction_norm
     first, second = across(declared)
     assert [first @ first, second @ second] == pytest.approx([1.0, 1.0])
     assert [first @ second, first @ declared, second @ declared] == pytest.approx(
         [0.0, 0.0, 0.0], abs=1e-12
     )
     turned = turned_gravity(declared, turn)
-    assert np.linalg.norm(turned) == pytest.approx(9.81)
+    turned_norm = np.linalg.norm(turned)
+    assert turned_norm == pytest.approx(9.81)
     angle = np.arccos(np.clip(turned @ declared / 9.81**2, -1.0, 1.0))
-    assert angle == pytest.approx(np.linalg.norm(turn), abs=1e-6)
+    turn_norm = np.linalg.norm(turn)
+    assert angle == pytest.approx(turn_norm, abs=1e-6)
 
 
 @settings(max_examples=30, deadline=None)
@@ -146,9 +155,11 @@ def test_gravity_keeps_its_length_and_is_found_again(
 def test_components_of_gravity_scatter_as_their_deviations_say(
     direction: tuple[float, float, float], deviations: tuple[float, float]
 ) -> None:
-    declared = 9.81 * np.array(direction) / np.linalg.norm(direction)
+    direction_norm = np.linalg.norm(direction)
+    declared = 9.81 * np.array(direction) / direction_norm
+    turn_rad = [deviations[0], 0.0]
     ends = [
-        turned_gravity(declared, [deviations[0], 0.0]),
+        turned_gravity(declared, turn_rad),
         turned_gravity(declared, [0.0, deviations[1]]),
     ]
     moved = np.linalg.norm([end - declared for end in ends], axis=0)
@@ -160,12 +171,14 @@ def test_values_between_samples_are_interpolated_and_ends_stay() -> None:
     values = np.sin(2.0 * np.pi * time_s)
     later = shifted(values, 1.3)
     assert later[10:-10] == pytest.approx(np.sin(2.0 * np.pi * (time_s[10:-10] + 0.013)), abs=1e-5)
-    assert later[-1] == values[-1]
+    expected = values[-1]
+    assert later[-1] == expected
     assert shifted(values, 0.0) == pytest.approx(values)
 
 
 def test_a_planned_motion_has_no_late_position() -> None:
-    late = (PlacedEffect(LatePosition(applied_s=0.004), 1),)
+    effect = LatePosition(applied_s=0.004)
+    late = (PlacedEffect(effect, 1),)
     recorded = _run()
     moved = corrected_dataset(recorded, late)
     assert not np.allclose(moved.position_rad[:, 1], recorded.position_rad[:, 1])
@@ -176,9 +189,11 @@ def test_a_planned_motion_has_no_late_position() -> None:
 
 def test_an_effect_is_the_same_one_after_each_correction() -> None:
     one = PlacedEffect(ZeroOffset(), 2)
-    other = PlacedEffect(ZeroOffset(applied_rad=0.03), 2)
+    effect = ZeroOffset(applied_rad=0.03)
+    other = PlacedEffect(effect, 2)
     assert one == other
-    assert [column.name for column in one.columns] == [column.name for column in other.columns]
+    expected = [column.name for column in other.columns]
+    assert [column.name for column in one.columns] == expected
     assert [column.about for column in other.columns] == [0.03]
 
 
@@ -186,18 +201,19 @@ def test_the_mounting_is_one_for_all_axes_and_a_zero_one_for_each() -> None:
     robot = three_axes_truth().model.robot
     assert [axis for axis in range(3) if is_placeable(GravityDirection(), axis, robot)] == [0]
     assert [axis for axis in range(3) if is_placeable(ZeroOffset(), axis, robot)] == [0, 1, 2]
-    assert PlacedEffect(GravityDirection(), 0).name_among(["J1"]) == "gravity-direction on all axes"
+    placed_effect = PlacedEffect(GravityDirection(), 0)
+    assert placed_effect.name_among(["J1"]) == "gravity-direction on all axes"
 
 
 def test_rotations_are_right_handed() -> None:
-    assert rotation_by(np.array([0.0, 0.0, np.pi / 2])) @ [1.0, 0.0, 0.0] == pytest.approx(
-        [0.0, 1.0, 0.0], abs=1e-12
-    )
+    vector_rad = np.array([0.0, 0.0, np.pi / 2])
+    assert rotation_by(vector_rad) @ [1.0, 0.0, 0.0] == pytest.approx([0.0, 1.0, 0.0], abs=1e-12)
     assert np.array_equal(rotation_by(np.zeros(3)), np.eye(3))
 
 
 def test_signals_without_an_arm_are_refused() -> None:
     truth = tx40_truth()
     signals = declared_signals(truth.model, _run(), truth.parameters, truth.gains)
+    changed_signal = replace(signals, arm=None)
     with pytest.raises(ValueError, match="without an arm"):
-        ZeroOffset().columns(replace(signals, arm=None), 0)
+        ZeroOffset().columns(changed_signal, 0)

@@ -199,15 +199,19 @@ def test_what_is_no_usable_effect_is_refused(effects: Any, words: str) -> None:
 
 def test_settings_of_numpy_are_numbers_of_python() -> None:
     """As from `numpy.linspace`; a calibration writes and reads them as any other."""
-    ((effect, *_),) = families_of([SquareDrag(np.float64(2.0))], "`own_effects`")
+    effects = [SquareDrag(np.float64(2.0))]
+    ((effect, *_),) = families_of(effects, "`own_effects`")
     assert effect == SquareDrag(2.0)
     assert type(effect.settings["exponent"]) is float
-    ((single,),) = families_of([SquareDrag(np.float32(2.0))], "`own_effects`")  # type: ignore[arg-type]
+    exponent = np.float32(2.0)
+    ((single,),) = families_of([SquareDrag(exponent)], "`own_effects`")  # type: ignore[arg-type]
     assert type(single.settings["exponent"]) is float
-    ((whole,),) = families_of([Declaring(driver=np.int64(3))], "`own_effects`")  # type: ignore[arg-type]
+    driver = np.int64(3)
+    ((whole,),) = families_of([Declaring(driver=driver)], "`own_effects`")  # type: ignore[arg-type]
     assert type(whole.settings["driver"]) is int
+    whole_exponent = SquareDrag(np.int64(2))  # type: ignore[arg-type]
     with pytest.raises(ident.EffectRefused, match="expected a value of type float"):
-        families_of([SquareDrag(np.int64(2))], "`own_effects`")  # type: ignore[arg-type]
+        families_of([whole_exponent], "`own_effects`")
 
 
 def test_effects_of_one_name_are_one_family() -> None:
@@ -219,7 +223,8 @@ def test_effects_of_one_name_are_one_family() -> None:
 
 def test_an_effect_of_no_package_is_named_by_its_module() -> None:
     assert package_of(SquareDrag()) == f"module {__name__}"
-    assert package_of(EFFECTS[0][0]) is None
+    effect = EFFECTS[0][0]
+    assert package_of(effect) is None
 
 
 @dataclass(frozen=True, slots=True)
@@ -240,21 +245,26 @@ class Given(SquareDrag):
 
 
 def test_columns_of_an_effect_of_ones_own_are_checked() -> None:
-    stub = SimpleNamespace(current_a=np.zeros((AXES, SAMPLES)), time_s=np.zeros(SAMPLES))
+    current_a = np.zeros((AXES, SAMPLES))
+    time_s = np.zeros(SAMPLES)
+    stub = SimpleNamespace(current_a=current_a, time_s=time_s)
     signals = cast(Signals, stub)
+    effect = Given(given=0)
     with pytest.raises(
         ident.EffectRefused,
         match=r"'given': found columns of shape \(5,\); "
         r"expected \(1, 5\)",
     ):
-        columns_at(Given(given=0), signals, 0)
+        columns_at(effect, signals, 0)
+    given_effect = Given(given=1)
     with pytest.raises(
         ident.EffectRefused,
         match=r"'given': found columns with numbers that are "
         r"not finite",
     ):
-        columns_at(Given(given=1), signals, 0)
-    assert np.array_equal(columns_at(Given(given=2), signals, 0), np.ones((1, SAMPLES)))
+        columns_at(given_effect, signals, 0)
+    columns = columns_at(Given(given=2), signals, 0)
+    assert np.array_equal(columns, np.ones((1, SAMPLES)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -272,9 +282,13 @@ class Failing(SquareDrag):
 
 @pytest.mark.parametrize(("error", "words"), [(0, "KeyError .*no such signal"), (1, "SystemExit")])
 def test_an_effect_of_ones_own_that_fails_is_refused_by_name(error: int, words: str) -> None:
-    stub = SimpleNamespace(current_a=np.zeros((AXES, SAMPLES)), time_s=np.zeros(SAMPLES))
+    current_a = np.zeros((AXES, SAMPLES))
+    time_s = np.zeros(SAMPLES)
+    stub = SimpleNamespace(current_a=current_a, time_s=time_s)
+    effect = Failing(error=error)
+    signals = cast(Signals, stub)
     with pytest.raises(ident.EffectRefused, match=rf"effect 'failing': found {words}"):
-        columns_at(Failing(error=error), cast(Signals, stub), 0)
+        columns_at(effect, signals, 0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -341,7 +355,8 @@ def test_an_installed_package_is_searched_and_named(site: Site) -> None:
     site.install("drag-one", _code("drag-one"))
     *shipped, family = search_families()
     assert tuple(shipped) == EFFECTS
-    assert [effect.settings for effect in family] == [{"exponent": 1.0}, {"exponent": 2.0}]
+    expected = [{"exponent": 1.0}, {"exponent": 2.0}]
+    assert [effect.settings for effect in family] == expected
     assert package_of(family[0]) == "drag-one 0.3"
     assert type(known_effect("square-drag")) is type(family[0])
 
@@ -355,7 +370,8 @@ def test_an_entry_point_may_name_one_effect(site: Site) -> None:
 def test_an_argument_takes_the_place_of_an_installed_effect(site: Site) -> None:
     site.install("drag-argued", _code("drag-argued"))
     own = SquareDrag(1.5)
-    assert search_families((own,)) == (*EFFECTS, (own,))
+    expected = (*EFFECTS, (own,))
+    assert search_families((own,)) == expected
     assert known_effect("square-drag", (own,)) is own
     assert package_of(own) == f"module {__name__}"
 
@@ -537,9 +553,11 @@ def test_settings_with_names_of_the_dictionary_mean_nothing() -> None:
 
 
 def test_two_effects_of_one_axis_differ_in_whole_numbers_alone() -> None:
-    assert effect_key(BORROWED, 0) == effect_key(replace(BORROWED, order=3.0, lower=4.0), 0)
+    effect = replace(BORROWED, order=3.0, lower=4.0)
+    assert effect_key(BORROWED, 0) == effect_key(effect, 0)
     for name in ("sense", "with_rotor", "held", "two_terms", "backwards"):
-        other = BORROWED.with_settings({name: 1 - int(BORROWED.settings[name])})
+        settings = {name: 1 - int(BORROWED.settings[name])}
+        other = BORROWED.with_settings(settings)
         assert effect_key(BORROWED, 0) != effect_key(other, 0), name
 
 
@@ -579,9 +597,10 @@ def test_a_meaning_that_a_class_declares_is_used() -> None:
         r"number of another of",
     ):
         check_settings(effect, effect.settings, 1, AXES)
+    settings = {**effect.settings, "form": 1}
     with pytest.raises(
         ident.EffectRefused,
         match=r"'declaring-drag' is given exponent = 1 in its "
         r"second form",
     ):
-        check_settings(effect, {**effect.settings, "form": 1}, 0, AXES)
+        check_settings(effect, settings, 0, AXES)

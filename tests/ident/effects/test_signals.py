@@ -61,7 +61,8 @@ def test_torques_are_of_the_load_through_the_gear_and_of_the_motor(
     )
     assert made.load_torque_nm == pytest.approx(load)
     assert made.geared_torque_nm == pytest.approx(geared)
-    assert made.motor_torque_nm == pytest.approx(small_truth.model.drive_train.to_motor @ whole)
+    to_motor = small_truth.model.drive_train.to_motor
+    assert made.motor_torque_nm == pytest.approx(to_motor @ whole)
     assert made.current_a * small_truth.gains[:, None] == pytest.approx(made.motor_torque_nm)
     assert made.motor_position_rad == pytest.approx(
         np.diag([40.0, 50.0, -45.0]) @ data.position_rad.T
@@ -94,10 +95,14 @@ def test_inertia_is_torque_per_acceleration_at_every_sample(
     )
     inertia = _inertia(_made(small_truth, data))
     found = np.einsum("ijk,kj->ik", inertia, acceleration)
-    assert np.max(np.abs(found - (moved - held))) < 0.01 * np.max(np.abs(moved - held))
+    absolute_moved = np.abs(found - (moved - held))
+    largest_absolute_moved = np.max(absolute_moved)
+    moved_difference = np.abs(moved - held)
+    assert largest_absolute_moved < 0.01 * np.max(moved_difference)
     assert inertia == pytest.approx(np.swapaxes(inertia, 0, 1), abs=1e-9)
     for sample in range(0, 1000, 100):
-        assert np.all(np.linalg.eigvalsh(inertia[:, :, sample]) > 0)
+        inertia_eigenvalues = np.linalg.eigvalsh(inertia[:, :, sample])
+        assert np.all(inertia_eigenvalues > 0)
 
 
 def test_of_an_estimate_the_rotor_of_a_regrouped_axis_counts_as_link(
@@ -106,12 +111,17 @@ def test_of_an_estimate_the_rotor_of_a_regrouped_axis_counts_as_link(
     """Ia of joints 1 and 2 cannot be distinguished from their links;
     that of joint 3 is a parameter of its own.
     """
-    found = _inertia(fitted_signals(small.model, data, small.training, small.estimate))
+    signals = fitted_signals(small.model, data, small.training, small.estimate)
+    found = _inertia(signals)
     true = _inertia(_made(small_truth, data))
     rotors = np.array([0.03, 0.03, 0.0])
     expected = true + np.diag(rotors)[:, :, None]
-    assert np.max(np.abs(found - expected)) < 0.05 * np.max(np.abs(true))
-    assert found[1, 1].mean() - true[1, 1].mean() == pytest.approx(0.03, abs=0.02)
+    largest_difference = np.max(np.abs(found - expected))
+    largest_absolute_true = np.max(np.abs(true))
+    assert largest_difference < 0.05 * largest_absolute_true
+    mean_true = true[1, 1].mean()
+    difference = found[1, 1].mean() - mean_true
+    assert difference == pytest.approx(0.03, abs=0.02)
 
 
 def test_the_session_clock_counts_from_the_first_run(small_truth: Truth, data: Dataset) -> None:
@@ -122,7 +132,8 @@ def test_the_session_clock_counts_from_the_first_run(small_truth: Truth, data: D
     for later, run in zip((0.0, 60.0, 130.0), made, strict=True):
         assert run.time_s[0] == 0.0
         assert run.session_s == pytest.approx(run.time_s + later)
-        assert np.all(np.diff(run.session_s) > 0)
+        session_steps_s = np.diff(run.session_s)
+        assert np.all(session_steps_s > 0)
 
 
 @pytest.mark.parametrize(
@@ -142,10 +153,10 @@ def test_runs_that_overlap_have_no_common_clock(
     """Stamps from each file's own start say nothing of the session;
     by the time of day a simulated cell may overlap.
     """
-    assert data.time_s[-1] - data.time_s[0] > 0.9
-    assert (
-        session_began_s([replace(data, started_s=started_s) for started_s in starts_s]) == began_s
-    )
+    time_difference_s = data.time_s[-1] - data.time_s[0]
+    assert time_difference_s > 0.9
+    datasets = [replace(data, started_s=started_s) for started_s in starts_s]
+    assert session_began_s(datasets) == began_s
 
 
 def test_without_a_clock_the_session_is_the_run(small_truth: Truth, data: Dataset) -> None:

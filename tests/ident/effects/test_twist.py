@@ -38,14 +38,17 @@ def _back_and_forth(weight_nm: float) -> DrivenLink:
     speed = np.zeros_like(time_s)
     for begin_s, direction in ((0.1, 1.0), (1.2, -1.0)):
         inside = (time_s >= begin_s) & (time_s < begin_s + 0.7)
-        speed[inside] = direction * 0.8 * np.sin(np.pi * (time_s[inside] - begin_s) / 0.7) ** 2
+        time_difference_s = time_s[inside] - begin_s
+        speed[inside] = direction * 0.8 * np.sin(np.pi * time_difference_s / 0.7) ** 2
     torque = weight_nm + INERTIA_KG_M2 * np.gradient(speed) * RATE_HZ
+    inertia_kg_m2 = np.full(len(time_s), INERTIA_KG_M2)
+    dry_nm = np.full(len(time_s), DRY_NM)
     return DrivenLink(
         RATE_HZ,
-        np.full(len(time_s), INERTIA_KG_M2),
+        inertia_kg_m2,
         torque,
         speed,
-        np.full(len(time_s), DRY_NM),
+        dry_nm,
     )
 
 
@@ -63,7 +66,8 @@ def _stepped(
         summed = 0.0
         for part in range(STEPS):
             share = part / STEPS
-            pressed = twist_rad - np.clip(twist_rad, -gap_rad, gap_rad)
+            clipped_twist_rad = np.clip(twist_rad, -gap_rad, gap_rad)
+            pressed = twist_rad - clipped_twist_rad
             force = pressed / compliance_rad_nm + damping * lag_rate
             if gap_rad > 0.0:
                 if pressed == 0.0:
@@ -96,13 +100,19 @@ def test_windows_hold_all_that_a_held_link_does(weight_nm: float, gap_rad: float
     with a spring between them.
     """
     link = _back_and_forth(weight_nm)
-    gears = Gears(np.array([gap_rad]), np.array([COMPLIANCE_RAD_NM]), RATIO)
+    half_gap_rad = np.array([gap_rad])
+    compliance_rad_nm = np.array([COMPLIANCE_RAD_NM])
+    gears = Gears(half_gap_rad, compliance_rad_nm, RATIO)
     found = twists(link, gears)
-    whole = _stepped(link, gap_rad, COMPLIANCE_RAD_NM, float(found.twist_rad[0, 0]))
+    twist_rad = float(found.twist_rad[0, 0])
+    whole = _stepped(link, gap_rad, COMPLIANCE_RAD_NM, twist_rad)
     settled = slice(150, -50)
-    left = (found.passed_nm[0] - whole)[settled]
+    passed_difference_nm = found.passed_nm[0] - whole
+    left = passed_difference_nm[settled]
     rigid = (link.pushed_nm - whole)[settled]
-    assert np.sqrt(np.mean(left**2)) < 0.15 * np.sqrt(np.mean(rigid**2))
+    rms = np.sqrt(np.mean(left**2))
+    rms_rigid = np.sqrt(np.mean(rigid**2))
+    assert rms < 0.15 * rms_rigid
 
 
 def test_a_motor_that_turns_back_crosses_the_gap_without_its_link() -> None:
@@ -112,9 +122,9 @@ def test_a_motor_that_turns_back_crosses_the_gap_without_its_link() -> None:
     link = _back_and_forth(2.0)
     way_rad = np.cumsum(link.speed_rad_s) / RATE_HZ
     turned = 1200
-    gears = Gears(
-        np.array([HALF_GAP_RAD, 2.0 * HALF_GAP_RAD]), np.full(2, COMPLIANCE_RAD_NM), RATIO
-    )
+    half_gap_rad = np.array([HALF_GAP_RAD, 2.0 * HALF_GAP_RAD])
+    compliance_rad_nm = np.full(2, COMPLIANCE_RAD_NM)
+    gears = Gears(half_gap_rad, compliance_rad_nm, RATIO)
     passed = twists(link, gears).passed_nm
     back_rad = way_rad[turned] - way_rad[turned:]
     unwound_rad = 10.0 * COMPLIANCE_RAD_NM
@@ -122,8 +132,10 @@ def test_a_motor_that_turns_back_crosses_the_gap_without_its_link() -> None:
         behind = one[turned:]
         is_in_gap = (back_rad > unwound_rad) & (back_rad < 1.8 * half_gap)
         is_across = back_rad > 2.5 * half_gap + unwound_rad
-        assert np.abs(behind[is_in_gap]).max() == 0.0
-        assert np.mean(behind[is_across][:100]) < -1.0
+        absolute_behind = np.abs(behind[is_in_gap])
+        assert absolute_behind.max() == 0.0
+        mean_behind = np.mean(behind[is_across][:100])
+        assert mean_behind < -1.0
 
 
 @given(dry_nm=st.floats(0.0, 20.0), weight_nm=st.floats(-5.0, 5.0))
@@ -132,13 +144,16 @@ def test_a_stiff_gear_without_a_gap_passes_what_a_rigid_one_does_in_motion(
     dry_nm: float, weight_nm: float
 ) -> None:
     link = replace(_back_and_forth(weight_nm), dry_nm=np.full(2400, dry_nm))
-    stiff = Gears(np.zeros(1), np.array([1e-7]), 1.0)
+    compliance_rad_nm = np.array([1e-7])
+    half_gap_rad = np.zeros(1)
+    stiff = Gears(half_gap_rad, compliance_rad_nm, 1.0)
     found = twists(link, stiff)
     is_fast = np.abs(link.speed_rad_s) > 0.3
     assert found.passed_nm[0][is_fast] == pytest.approx(
         link.pushed_nm[is_fast], abs=0.05 * (1.0 + dry_nm)
     )
-    assert np.abs(found.twist_rad).max() < 1e-5
+    absolute_twist_rad = np.abs(found.twist_rad)
+    assert absolute_twist_rad.max() < 1e-5
 
 
 @pytest.fixture(scope="module")
@@ -165,16 +180,21 @@ def test_a_twist_changes_the_torque_as_the_model_of_the_twisted_arm_says(
         changed[:, AXIS] -= by
         return changed
 
+    position_rad = lagging(motion.position_rad, twist)
+    velocity_rad_s = lagging(motion.velocity_rad_s, rate)
     twisted = Motion(
-        lagging(motion.position_rad, twist),
-        lagging(motion.velocity_rad_s, rate),
+        position_rad,
+        velocity_rad_s,
         lagging(motion.acceleration_rad_s2, bend),
     )
     expected = run.arm.load_change(twisted)
-    pushed = replace(motion, acceleration_rad_s2=lagging(motion.acceleration_rad_s2, bend))
-    found = torque_of_twist(run, AXIS, twist) + run.arm.load_change(pushed)
+    acceleration_rad_s2 = lagging(motion.acceleration_rad_s2, bend)
+    pushed = replace(motion, acceleration_rad_s2=acceleration_rad_s2)
+    torque = torque_of_twist(run, AXIS, twist)
+    found = torque + run.arm.load_change(pushed)
     inside = slice(5, -5)
-    scale = np.abs(expected[:, inside]).max()
+    absolute_expected = np.abs(expected[:, inside])
+    scale = absolute_expected.max()
     assert found[:, inside] == pytest.approx(expected[:, inside], abs=0.01 * scale)
 
 
@@ -184,11 +204,14 @@ def test_a_constant_twist_is_a_zero_that_is_off(run: Signals) -> None:
     half_gap = 2e-3
     position = run.arm.motion.position_rad.copy()
     position[:, AXIS] -= half_gap
-    expected = run.arm.load_change(replace(run.arm.motion, position_rad=position))
-    found = torque_of_twist(run, AXIS, np.full(len(run.time_s), half_gap))
+    motion = replace(run.arm.motion, position_rad=position)
+    expected = run.arm.load_change(motion)
+    twist_rad = np.full(len(run.time_s), half_gap)
+    found = torque_of_twist(run, AXIS, twist_rad)
     assert np.abs(expected).max() > 1e-3
     # Derivatives are interpolated between postures 10 ms apart.
-    assert found == pytest.approx(expected, abs=5e-3 * np.abs(expected).max())
+    largest_absolute_expected = np.abs(expected).max()
+    assert found == pytest.approx(expected, abs=5e-3 * largest_absolute_expected)
 
 
 def test_without_friction_a_held_link_is_one_that_is_not(run: Signals) -> None:
@@ -199,17 +222,20 @@ def test_without_friction_a_held_link_is_one_that_is_not(run: Signals) -> None:
     assert held.columns(free, AXIS)[other] == pytest.approx(
         moves_with_motor.columns(free, AXIS)[other], abs=1e-6
     )
-    assert not np.any(link_of(free, AXIS, held=True).dry_nm)
+    link = link_of(free, AXIS, held=True)
+    assert not np.any(link.dry_nm)
 
 
 def test_a_rotor_in_the_load_does_not_move_behind_the_gear(run: Signals) -> None:
     """A setting of the effect does what a known rotor of the signals does."""
-    inertia_kg_m2 = 0.3 * float(run.inertia(AXIS, AXIS).min())
+    smallest = run.inertia(AXIS, AXIS).min()
+    inertia_kg_m2 = 0.3 * float(smallest)
     known = [0.0] * len(run.current_a)
     known[AXIS] = inertia_kg_m2
     beside = replace(run, rotor_inertia_kg_m2=tuple(known))
+    backlash = Backlash(0.0, HALF_GAP_RAD, COMPLIANCE_RAD_NM, RATIO, 1)
     for effect in (
-        Backlash(0.0, HALF_GAP_RAD, COMPLIANCE_RAD_NM, RATIO, 1),
+        backlash,
         Elasticity(COMPLIANCE_RAD_NM, RATIO, 1),
     ):
         with_rotor = effect.with_settings({"rotor_inertia_kg_m2": inertia_kg_m2})

@@ -44,7 +44,8 @@ class Recording:
     def currents(self) -> Currents:
         """All rows, not reduced."""
         rows = tuple(self.motor_rows(motor) for motor in range(3))
-        return Currents.of_motors(Triangles(rows, np.array([len(one) for one in rows])))
+        triangles = Triangles(rows, np.array([len(one) for one in rows]))
+        return Currents.of_motors(triangles)
 
 
 @pytest.fixture
@@ -72,7 +73,8 @@ def test_whitened_rows_have_the_noise_of_one(recording: Recording) -> None:
     many = Recording(4000).currents()
     residual = many.whitened(GAINS, NOISE).residual(GAINS, PARAMETERS).reshape(3, -1)
     # Four standard errors of a deviation, 1/√(2·4000).
-    assert_allclose(residual.std(axis=1), 1.0, atol=0.045)
+    residual_std = residual.std(axis=1)
+    assert_allclose(residual_std, 1.0, atol=0.045)
 
 
 def test_the_noise_of_each_current_is_found_with_its_degrees_of_freedom(
@@ -80,16 +82,19 @@ def test_the_noise_of_each_current_is_found_with_its_degrees_of_freedom(
 ) -> None:
     currents = recording.currents()
     errors = recording.current - recording.torque / GAINS[:, None]
-    expected = np.linalg.norm(errors, axis=1) / np.sqrt(ROWS - 5 / 3)
+    rows_root = np.sqrt(ROWS - 5 / 3)
+    expected = np.linalg.norm(errors, axis=1) / rows_root
     assert_allclose(currents.noise(GAINS, PARAMETERS, free=5), expected, rtol=1e-10)
 
 
 def test_a_motor_without_rows_has_a_noise_of_one(recording: Recording) -> None:
     rows = (recording.motor_rows(0), np.empty((0, 4)), recording.motor_rows(2))
-    currents = Currents.of_motors(Triangles(rows, np.array([ROWS, 0, ROWS])))
+    triangles = Triangles(rows, np.array([ROWS, 0, ROWS]))
+    currents = Currents.of_motors(triangles)
     noise = currents.noise(GAINS, PARAMETERS)
     assert noise[1] == 1.0
-    assert_allclose(noise[[0, 2]], NOISE[[0, 2]], rtol=0.4)
+    expected = NOISE[[0, 2]]
+    assert_allclose(noise[[0, 2]], expected, rtol=0.4)
 
 
 def test_the_cost_is_that_of_the_likelihood(recording: Recording) -> None:
@@ -104,7 +109,8 @@ def test_settled_parameters_and_noise_belong_to_each_other(recording: Recording)
     parameters, noise = currents.settled(GAINS, free=2)
     again = currents.whitened(GAINS, noise).parameters(GAINS)
     assert_allclose(parameters, again, rtol=1e-8)
-    assert_allclose(noise, currents.noise(GAINS, parameters, free=2), rtol=1e-8)
+    expected = currents.noise(GAINS, parameters, free=2)
+    assert_allclose(noise, expected, rtol=1e-8)
     assert_allclose(noise, NOISE, rtol=0.4)
     assert_allclose(parameters, PARAMETERS, atol=0.1)
 
@@ -112,7 +118,8 @@ def test_settled_parameters_and_noise_belong_to_each_other(recording: Recording)
 def _slope(currents: Currents, motor: int) -> FloatArray:
     """Finite difference of the whitened residual to one gain, the noise held."""
     step = np.zeros(3)
-    step[motor] = 1e-6 * abs(GAINS[motor])
+    absolute_gain = abs(GAINS[motor])
+    step[motor] = 1e-6 * absolute_gain
     more = currents.whitened(GAINS + step, NOISE).residual(GAINS + step, PARAMETERS)
     less = currents.whitened(GAINS - step, NOISE).residual(GAINS - step, PARAMETERS)
     return np.asarray((more - less) / (2.0 * step[motor]))
@@ -125,7 +132,8 @@ def test_corrected_currents_are_the_slope_of_the_residual(recording: Recording, 
     residual = whitened.residual(GAINS, PARAMETERS)
     corrected = currents.corrected(GAINS, NOISE, whitened, residual)
     expected = _slope(currents, motor)
-    assert_allclose(corrected[:, motor], expected, atol=1e-7 * np.abs(expected).max())
+    largest_absolute_expected = np.abs(expected).max()
+    assert_allclose(corrected[:, motor], expected, atol=1e-7 * largest_absolute_expected)
 
 
 # Motors that work against each other
@@ -136,7 +144,8 @@ def preload() -> FloatArray:
     """One direction of torques that moves nothing, another one in each row, shape (r, 3, 1)."""
     rng = np.random.default_rng(8)
     directions = rng.normal(size=(ROWS, 3, 1))
-    return np.asarray(directions / np.linalg.norm(directions, axis=1, keepdims=True))
+    direction_norm = np.linalg.norm(directions, axis=1, keepdims=True)
+    return np.asarray(directions / direction_norm)
 
 
 @pytest.fixture
@@ -145,7 +154,8 @@ def preloaded(recording: Recording, preload: FloatArray) -> PreloadedCurrents:
     for motor in range(3):
         drive = np.zeros((ROWS, 3))
         drive[:, motor] = recording.current[motor]
-        rows.append(np.column_stack((drive, recording.linear[motor], recording.known[motor])))
+        stacked_drive = np.column_stack((drive, recording.linear[motor], recording.known[motor]))
+        rows.append(stacked_drive)
     return PreloadedCurrents.of_rows(rows, preload)
 
 
@@ -182,12 +192,14 @@ def test_corrected_currents_give_the_slope_of_the_cost_with_preload(
     gradient = preloaded.corrected(GAINS, NOISE, whitened, residual).T @ residual
     for motor in range(3):
         step = np.zeros(3)
-        step[motor] = 1e-6 * abs(GAINS[motor])
+        absolute_gain = abs(GAINS[motor])
+        step[motor] = 1e-6 * absolute_gain
         more = preloaded.cost(GAINS + step, PARAMETERS, NOISE)
         less = preloaded.cost(GAINS - step, PARAMETERS, NOISE)
         expected = (more - less) / (2.0 * step[motor])
+        largest_absolute_gradient = np.abs(gradient).max()
         assert gradient[motor] == pytest.approx(
-            expected, rel=1e-5, abs=1e-4 * np.abs(gradient).max()
+            expected, rel=1e-5, abs=1e-4 * largest_absolute_gradient
         )
 
 
@@ -206,7 +218,8 @@ def test_the_noise_beside_a_preload_is_found_from_what_is_visible_of_it() -> Non
     for motor in range(3):
         drive = np.zeros((rows, 3))
         drive[:, motor] = many.current[motor]
-        of_motors.append(np.column_stack((drive, many.linear[motor], many.known[motor])))
+        stacked_drive = np.column_stack((drive, many.linear[motor], many.known[motor]))
+        of_motors.append(stacked_drive)
     currents = PreloadedCurrents.of_rows(of_motors, directions)
     noise = currents.noise(GAINS, PARAMETERS)
     # A third of the noise is hidden by the preload; of 6000 rows some 4000 are seen: four standard

@@ -48,7 +48,8 @@ def test_a_row_counts_where_standstill_has_a_small_share_of_its_window(
     for axis in range(3):
         share = _share(weights, windows, ~data.moving[:, axis])
         # No row is at the limit itself, where rounding decides.
-        assert np.abs(share - SMALL.standstill_share).min() > 1e-12
+        share_difference = np.abs(share - SMALL.standstill_share)
+        assert share_difference.min() > 1e-12
         expected = share <= SMALL.standstill_share
         assert expected.any()
         assert not expected.all()
@@ -88,7 +89,8 @@ def test_the_motion_at_the_rows_is_that_at_the_centres_of_their_windows(data: Da
     rows = at_rows(data, SMALL)
     centres = decimator(data.rate_hz, SMALL.decimation_cutoff_hz).centres(len(data.time_s))
     assert_allclose(rows.time_s, data.time_s[centres], atol=1e-9)
-    assert rows.rate_hz == pytest.approx(1.0 / np.median(np.diff(rows.time_s)))
+    median_time_s_step = np.median(np.diff(rows.time_s))
+    assert rows.rate_hz == pytest.approx(1.0 / median_time_s_step)
     # A slow motion passes the filter.
     assert_allclose(rows.position_rad, data.position_rad[centres], atol=2e-3)
     assert rows.velocity_rad_s.shape == rows.position_rad.shape
@@ -96,7 +98,8 @@ def test_the_motion_at_the_rows_is_that_at_the_centres_of_their_windows(data: Da
 
 
 def test_temperatures_are_at_the_rows_too(data: Dataset) -> None:
-    warm = replace(data, temperature_c=np.full(data.position_rad.shape, 40.0))
+    temperature_c = np.full(data.position_rad.shape, 40.0)
+    warm = replace(data, temperature_c=temperature_c)
     rows = at_rows(warm, SMALL)
     assert rows.temperature_c is not None
     assert_allclose(rows.temperature_c, 40.0, rtol=1e-9)
@@ -114,7 +117,8 @@ def test_a_run_of_fewer_than_ten_rows_is_refused(data: Dataset) -> None:
 
 @pytest.mark.parametrize("chunk_rows", [1, 3, 7, 1000])
 def test_pieces_have_every_window_once_and_whole(chunk_rows: int) -> None:
-    filter_ = Decimator(np.full(9, 1.0 / 9.0), 4)
+    taps = np.full(9, 1.0 / 9.0)
+    filter_ = Decimator(taps, 4)
     samples = np.arange(103.0)
     pieces = [filter_(samples[part]) for part in chunks(filter_, len(samples), chunk_rows)]
     assert_allclose(np.concatenate(pieces), filter_(samples), rtol=1e-12)

@@ -37,7 +37,8 @@ def test_the_torque_of_a_given_unknown_joins_the_last_column() -> None:
     given = GivenUnknowns.of(values, unknowns)
     solution = np.array([3.0, -1.0, 7.0, 0.5, 0.0, 9.0, 1.0])
     joined = given.joined_in(rows, currents)
-    assert joined.shape == (10, currents + 2 + 1)
+    expected = (10, currents + 2 + 1)
+    assert joined.shape == expected
     left = np.array([3.0, -1.0, 7.0, 9.0, 1.0])
     assert_allclose(joined @ left, rows @ solution, rtol=1e-12)
 
@@ -47,11 +48,14 @@ def test_a_system_with_given_unknowns_has_the_residual_of_the_whole_one(
 ) -> None:
     gains = noisy_found.estimate.gains
     parameters = noisy_found.estimate.parameters
-    given = {0: float(parameters[0]), 3: float(parameters[3])}
+    parameter = float(parameters[0])
+    given = {0: parameter, 3: float(parameters[3])}
     reduced = system.holding(given)
     kept = np.delete(parameters, list(given))
-    assert len(reduced.unknowns) == len(system.unknowns) - 2
-    whole = system.joints.square_sum(np.concatenate((gains, parameters, [1.0])))
+    expected = len(system.unknowns) - 2
+    assert len(reduced.unknowns) == expected
+    stacked_gains = np.concatenate((gains, parameters, [1.0]))
+    whole = system.joints.square_sum(stacked_gains)
     less = reduced.joints.square_sum(np.concatenate((gains, kept, [1.0])))
     assert_allclose(less, whole, rtol=1e-8)
     of_motors = reduced.currents.cost(gains, kept, np.ones(len(gains)))
@@ -67,7 +71,8 @@ def test_the_condition_does_not_depend_on_the_unit_of_an_effect(
     solution = np.concatenate((estimate.gains, estimate.parameters, [1.0]))
     name = system.columns[0].name
     # The first column is taken for that of an effect.
-    base = replace(system.base, names=tuple(one for one in system.base.names if one != name))
+    names = tuple(one for one in system.base.names if one != name)
+    base = replace(system.base, names=names)
     first = system.axis_count
     values = []
     for unit in (1.0, 1e6):
@@ -80,9 +85,8 @@ def test_the_condition_does_not_depend_on_the_unit_of_an_effect(
         scaled_solution = solution.copy()
         scaled_solution[first] /= unit
         changed = replace(system, base=base, joints=joints)
-        values.append(
-            changed.weighted_singular_values(scaled_solution, len(solution) - 1, gains=True)
-        )
+        free = len(solution) - 1
+        values.append(changed.weighted_singular_values(scaled_solution, free, gains=True))
     assert_allclose(values[0], values[1], rtol=1e-9)
     assert values[0][0] / values[0][-1] > 10.0
 
@@ -93,7 +97,8 @@ def test_singular_values_are_of_the_weighted_unknowns(
     estimate = noisy_found.estimate
     solution = np.concatenate((estimate.gains, estimate.parameters, [1.0]))
     free = len(solution) - 1
-    weighted = system.joints.stacked(1.0 / system.joints.residual_std(solution, free))
+    weight = 1.0 / system.joints.residual_std(solution, free)
+    weighted = system.joints.stacked(weight)
     with_gains = np.linalg.svd(weighted[:, :-1], compute_uv=False)
     without = np.linalg.svd(weighted[:, system.axis_count : -1], compute_uv=False)
     assert_allclose(
@@ -108,13 +113,16 @@ def test_as_many_rows_as_unknowns_are_too_few(system: System) -> None:
     count = len(system.unknowns)
     rows = system.motors.rows.copy()
     rows[2] = count + 1
-    require_rows(replace(system, motors=replace(system.motors, rows=rows)))
+    motors = replace(system.motors, rows=rows)
+    require_rows(replace(system, motors=motors))
     rows[2] = count
+    changed_motor = replace(system.motors, rows=rows)
     with pytest.raises(DataUnfit, match=f"motor 3 has {count} usable rows for {count} unknowns"):
-        require_rows(replace(system, motors=replace(system.motors, rows=rows)))
+        require_rows(replace(system, motors=changed_motor))
     rows[2] = 0
+    changed_motor_motors = replace(system.motors, rows=rows)
     with pytest.raises(DataUnfit, match="which motor 3 turns with, never move at the same time"):
-        require_rows(replace(system, motors=replace(system.motors, rows=rows)))
+        require_rows(replace(system, motors=changed_motor_motors))
 
 
 def test_without_a_known_payload_nothing_sets_the_scale(system: System) -> None:
@@ -124,7 +132,8 @@ def test_without_a_known_payload_nothing_sets_the_scale(system: System) -> None:
         unloaded = factor.copy()
         unloaded[:, -1] = 0.0
         factors.append(unloaded)
-    bare = replace(system, joints=Triangles(tuple(factors), system.joints.rows))
+    joints = Triangles(tuple(factors), system.joints.rows)
+    bare = replace(system, joints=joints)
     with pytest.raises(PayloadMissing):
         require_known_payload(bare)
 
@@ -133,7 +142,8 @@ def test_a_current_of_zero_is_named(system: System) -> None:
     require_distinct(system, gains=True)
     factors = [factor.copy() for factor in system.motors.factors]
     factors[1][:, 0] = 0.0
-    silent = replace(system, motors=Triangles(tuple(factors), system.motors.rows))
+    motors = Triangles(tuple(factors), system.motors.rows)
+    silent = replace(system, motors=motors)
     with pytest.raises(RankDeficient, match="the current of motor 2 is zero throughout"):
         require_distinct(silent, gains=True)
     require_distinct(silent, gains=False)
@@ -146,7 +156,8 @@ def test_equal_columns_are_named(system: System) -> None:
         doubled = factor.copy()
         doubled[:, first + 1] = doubled[:, first]
         factors.append(doubled)
-    same = replace(system, joints=Triangles(tuple(factors), system.joints.rows))
+    joints = Triangles(tuple(factors), system.joints.rows)
+    same = replace(system, joints=joints)
     with pytest.raises(RankDeficient, match="do not distinguish payload and robot") as caught:
         require_distinct(same, gains=False)
     lost = str(caught.value)

@@ -52,7 +52,8 @@ def test_the_deviation_of_a_residual_counts_rows_less_a_share_of_the_unknowns(
     expected = []
     for own, count in zip(rows, ROWS, strict=True):
         # Ten unknowns are shared by two axes.
-        expected.append(np.linalg.norm(own @ vector) / np.sqrt(count - 5.0))
+        count_root = np.sqrt(count - 5.0)
+        expected.append(np.linalg.norm(own @ vector) / count_root)
     assert_allclose(triangles.residual_std(vector, free=10), expected, rtol=1e-12)
 
 
@@ -71,16 +72,20 @@ def test_the_deviation_of_random_rows_is_that_of_their_noise() -> None:
     right = columns @ [1.0, 2.0, 3.0] + noise
     fitted = np.linalg.lstsq(columns, right, rcond=None)[0]
     both = np.column_stack((columns, right))
-    one_axis = Triangles((triangle((both,), 4),), np.array([2000]))
-    std = one_axis.residual_std(np.array([*-fitted, 1.0]), free=3)
+    factors = (triangle((both,), 4),)
+    one_axis = Triangles(factors, np.array([2000]))
+    vector = np.array([*-fitted, 1.0])
+    std = one_axis.residual_std(vector, free=3)
     # Four times the standard error of a deviation, 0.2/√(2·2000).
     assert std[0] == pytest.approx(0.2, abs=0.013)
 
 
 def test_stacked_axes_are_scaled_each_by_its_weight(triangles: Triangles) -> None:
-    stacked = triangles.stacked(np.array([2.0, 0.5]))
+    weight = np.array([2.0, 0.5])
+    stacked = triangles.stacked(weight)
     first = len(triangles.factors[0])
-    assert_allclose(stacked[:first], 2.0 * triangles.factors[0])
+    expected = 2.0 * triangles.factors[0]
+    assert_allclose(stacked[:first], expected)
     assert_allclose(stacked[first:], 0.5 * triangles.factors[1])
 
 
@@ -96,7 +101,8 @@ def test_a_triangle_of_columns_has_zeros_for_columns_without_entries(rows: int, 
     columns = rng.normal(size=(5, rows))
     columns[[1, 4]] = 0.0
     factor = triangle_of(columns)
-    assert_allclose(factor.T @ factor, columns @ columns.T, atol=1e-12 * rows)
+    expected = columns @ columns.T
+    assert_allclose(factor.T @ factor, expected, atol=1e-12 * rows)
     assert not factor[:, [1, 4]].any()
 
 
@@ -106,8 +112,10 @@ def test_least_squares_has_the_solution_and_the_inverse_of_the_normal_equations(
     matrix = rng.normal(size=(40, 3)) * [1.0, 1e-4, 1e3]
     right = rng.normal(size=40)
     solution, inverse = solve(matrix, right)
-    assert_allclose(solution, np.linalg.lstsq(matrix, right, rcond=None)[0], rtol=1e-7)
-    assert_allclose(inverse, np.linalg.inv(matrix.T @ matrix), rtol=1e-7)
+    expected = np.linalg.lstsq(matrix, right, rcond=None)[0]
+    assert_allclose(solution, expected, rtol=1e-7)
+    inverse_expected = np.linalg.inv(matrix.T @ matrix)
+    assert_allclose(inverse, inverse_expected, rtol=1e-7)
 
 
 def test_a_column_of_zeros_gets_zero_and_leaves_the_others_alone() -> None:
@@ -117,9 +125,11 @@ def test_a_column_of_zeros_gets_zero_and_leaves_the_others_alone() -> None:
     right = rng.normal(size=40)
     solution, inverse = solve(matrix, right)
     others = matrix[:, [0, 2]]
-    assert_allclose(solution[[0, 2]], np.linalg.lstsq(others, right, rcond=None)[0], rtol=1e-12)
+    expected = np.linalg.lstsq(others, right, rcond=None)[0]
+    assert_allclose(solution[[0, 2]], expected, rtol=1e-12)
     assert solution[1] == 0.0
-    assert_allclose(inverse[np.ix_([0, 2], [0, 2])], np.linalg.inv(others.T @ others), rtol=1e-12)
+    inverse_expected = np.linalg.inv(others.T @ others)
+    assert_allclose(inverse[np.ix_([0, 2], [0, 2])], inverse_expected, rtol=1e-12)
 
 
 def test_of_two_equal_columns_each_gets_half() -> None:
@@ -168,13 +178,17 @@ def test_back_substitution_leaves_nearly_equal_columns_to_singular_values(
 def test_a_triangle_of_many_rows_is_numpys_up_to_the_signs_of_its_rows(
     rows: int, seed: int
 ) -> None:
-    matrix = np.random.default_rng(seed).normal(size=(rows, COLUMNS))
+    rng = np.random.default_rng(seed)
+    matrix = rng.normal(size=(rows, COLUMNS))
     found = triangle((matrix,), COLUMNS)
     expected = np.linalg.qr(matrix, mode="r")
-    signs = np.sign(np.diag(found)) * np.sign(np.diag(expected))
+    diagonal_sign = np.sign(np.diag(found))
+    expected_diagonal_sign = np.sign(np.diag(expected))
+    signs = diagonal_sign * expected_diagonal_sign
     assert_allclose(signs[:, None] * found, expected, rtol=1e-9, atol=1e-9)
 
 
 def test_singular_values_fall() -> None:
-    values = singular_values(np.diag([1.0, 3.0, 2.0]))
+    matrix = np.diag([1.0, 3.0, 2.0])
+    values = singular_values(matrix)
     assert_allclose(values, [3.0, 2.0, 1.0])

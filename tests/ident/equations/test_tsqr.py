@@ -30,7 +30,8 @@ def _gram_error(triangle: FloatArray, matrix: FloatArray) -> float:
 def _streamed(matrix: FloatArray, cuts: list[int]) -> FloatArray:
     triangle = None
     for first, last in pairwise([0, *sorted(cuts), len(matrix)]):
-        triangle = qr_update(triangle, np.ascontiguousarray(matrix[first:last].T))
+        columns = np.ascontiguousarray(matrix[first:last].T)
+        triangle = qr_update(triangle, columns)
     assert triangle is not None
     return triangle
 
@@ -64,19 +65,30 @@ def test_any_cutting_gives_the_triangle_of_the_whole(
 @settings(deadline=None, max_examples=50)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 40), st.integers(40, 300), st.integers(1, 90))
 def test_equals_numpy_up_to_the_signs_of_rows(seed: int, count: int, rows: int, chunk: int) -> None:
-    matrix = np.random.default_rng(seed).normal(size=(rows + count, count))
+    rng = np.random.default_rng(seed)
+    matrix = rng.normal(size=(rows + count, count))
     expected = np.linalg.qr(matrix, mode="r")
-    found = _streamed(matrix, list(range(chunk, len(matrix), chunk)))
-    signs = np.sign(np.diag(found)) * np.sign(np.diag(expected))
-    bound = 1e-12 * np.linalg.cond(matrix) * np.linalg.norm(matrix)
-    assert np.max(np.abs(signs[:, None] * found - expected)) < bound
+    cuts = list(range(chunk, len(matrix), chunk))
+    found = _streamed(matrix, cuts)
+    diagonal_sign = np.sign(np.diag(found))
+    expected_diagonal_sign = np.sign(np.diag(expected))
+    signs = diagonal_sign * expected_diagonal_sign
+    matrix_condition = np.linalg.cond(matrix)
+    matrix_norm = np.linalg.norm(matrix)
+    bound = 1e-12 * matrix_condition * matrix_norm
+    absolute_expected = np.abs(signs[:, None] * found - expected)
+    assert np.max(absolute_expected) < bound
 
 
 def test_blocks_inside_one_call_do_not_show() -> None:
-    matrix = np.random.default_rng(5).normal(size=(2 * BLOCK_ROWS + 17, 9))
+    rng = np.random.default_rng(5)
+    matrix = rng.normal(size=(2 * BLOCK_ROWS + 17, 9))
     expected = np.linalg.qr(matrix, mode="r")
-    found = qr_update(None, np.ascontiguousarray(matrix.T))
-    assert np.abs(np.diag(found)) == pytest.approx(np.abs(np.diag(expected)), rel=1e-12)
+    columns = np.ascontiguousarray(matrix.T)
+    found = qr_update(None, columns)
+    absolute_diagonal = np.abs(np.diag(found))
+    absolute_expected_diagonal = np.abs(np.diag(expected))
+    assert absolute_diagonal == pytest.approx(absolute_expected_diagonal, rel=1e-12)
     assert _gram_error(found, matrix) < 1e-13
     # The same rows as a view whose time is not contiguous.
     assert np.array_equal(qr_update(None, matrix.T), found)
@@ -88,8 +100,10 @@ def test_keeps_singular_values_that_the_gram_matrix_loses() -> None:
     right = np.linalg.qr(rng.normal(size=(12, 12)))[0]
     truth = np.logspace(0.0, -11.0, 12)
     matrix = (left * truth) @ right.T
-    streamed = np.linalg.svd(_streamed(matrix, list(range(100, 3000, 100))), compute_uv=False)
-    assert np.max(np.abs(streamed - truth)) < 1e-14
+    cuts = list(range(100, 3000, 100))
+    streamed = np.linalg.svd(_streamed(matrix, cuts), compute_uv=False)
+    streamed_difference = np.abs(streamed - truth)
+    assert np.max(streamed_difference) < 1e-14
     gram = np.sqrt(np.abs(np.linalg.eigvalsh(matrix.T @ matrix)))[::-1]
     assert abs(gram[-1] / truth[-1] - 1.0) > 1.0
 
@@ -106,12 +120,15 @@ def test_leaves_its_arguments_alone() -> None:
 
 
 def test_other_columns_than_before_are_refused() -> None:
+    triangle = np.zeros((4, 4))
+    columns = np.zeros((3, 10))
     with pytest.raises(ValueError, match="expected 4 columns"):
-        qr_update(np.zeros((4, 4)), np.zeros((3, 10)))
+        qr_update(triangle, columns)
 
 
 def test_no_rows_are_a_zero_triangle() -> None:
-    assert np.array_equal(qr_update(None, np.zeros((3, 0))), np.zeros((3, 3)))
+    columns = np.zeros((3, 0))
+    assert np.array_equal(qr_update(None, columns), np.zeros((3, 3)))
     assert np.array_equal(qr_merge((), 2), np.zeros((2, 2)))
 
 
@@ -124,5 +141,8 @@ def test_joints_meet_in_one_triangle() -> None:
         rows = np.zeros((30, 5))
         rows[:, chosen] = rng.normal(size=(30, len(chosen)))
         whole.append(rows)
-        parts.append((qr_update(None, np.ascontiguousarray(rows[:, chosen].T)), chosen))
-    assert _gram_error(qr_merge(parts, 5), np.concatenate(whole)) < 1e-13
+        columns = np.ascontiguousarray(rows[:, chosen].T)
+        parts.append((qr_update(None, columns), chosen))
+    triangle = qr_merge(parts, 5)
+    matrix = np.concatenate(whole)
+    assert _gram_error(triangle, matrix) < 1e-13

@@ -31,7 +31,8 @@ NOISE_A = 0.03
 
 
 def _made(name: str) -> Made:
-    return recorded(next(one for one in MECHANISMS if one.name == name))
+    mechanism = next(one for one in MECHANISMS if one.name == name)
+    return recorded(mechanism)
 
 
 @cache
@@ -52,7 +53,8 @@ def test_exact_recordings_give_the_gains_back(mechanism: Mechanism, method: Meth
 @pytest.mark.parametrize("mechanism", MECHANISMS, ids=lambda one: one.name)
 def test_parameters_are_those_of_the_base_grouping(mechanism: Mechanism) -> None:
     found = _fitted(mechanism.name)
-    expected = found.system.base.grouping @ _made(mechanism.name).standard
+    standard = _made(mechanism.name).standard
+    expected = found.system.base.grouping @ standard
     own = found.estimate.parameters[: len(expected)]
     assert own == pytest.approx(expected, rel=1e-5, abs=1e-6)
 
@@ -62,7 +64,8 @@ def test_five_bar_has_the_base_parameters_of_the_paper_and_pencil() -> None:
     3 of each drive.
     """
     names = _fitted(FIVE_BAR.name).system.base.names
-    assert len(names) == 4 * 3 - 1 + 2 * 3
+    expected = 4 * 3 - 1 + 2 * 3
+    assert len(names) == expected
     assert sum(name.startswith(("Izz", "mx", "my")) for name in names) == 11
 
 
@@ -77,14 +80,18 @@ def test_noise_does_not_bend_the_gains_of_a_preloaded_drive() -> None:
         made = recorded(PLANAR, seed, seconds=12.0, noise_a=NOISE_A)
         found = identify(made.model, made.runs, made.conditioning).estimate
         errors.append(found.gains / PLANAR.gains - 1.0)
-        deviations.append(found.gains_std / np.abs(PLANAR.gains))
+        absolute_gain = np.abs(PLANAR.gains)
+        deviations.append(found.gains_std / absolute_gain)
         noises.append(found.axis_noise)
     mean = np.mean(errors, axis=0)
     expected = np.mean(deviations, axis=0)
-    assert np.all(np.abs(mean) < 3.5 * expected / np.sqrt(len(SEEDS)))
-    assert 0.5 < np.sqrt(np.mean(np.square(errors))) / np.sqrt(np.mean(np.square(deviations))) < 1.5
+    seed_count_root = np.sqrt(len(SEEDS))
+    assert np.all(np.abs(mean) < 3.5 * expected / seed_count_root)
+    mean_squared_deviation = np.mean(np.square(deviations))
+    assert 0.5 < np.sqrt(np.mean(np.square(errors))) / np.sqrt(mean_squared_deviation) < 1.5
     # White noise behind the decimation: each motor shows the same share of it.
-    assert np.mean(noises, axis=0) == pytest.approx(np.full(4, np.mean(noises)), rel=0.06)
+    mean_noise = np.mean(noises, axis=0)
+    assert mean_noise == pytest.approx(np.full(4, np.mean(noises)), rel=0.06)
 
 
 def test_tls_of_a_redundant_robot_has_residual_weights() -> None:
@@ -113,7 +120,8 @@ def test_what_the_preload_hides_is_taken_out_exactly() -> None:
 def test_the_gain_columns_are_derivatives() -> None:
     """The least e(g)ᵀe(g) over all preloads, at given σ, falls as they say."""
     made = recorded(PLANAR, noise_a=NOISE_A)
-    currents = identify(made.model, made.runs, made.conditioning).system.currents
+    system = identify(made.model, made.runs, made.conditioning).system
+    currents = system.currents
     assert isinstance(currents, PreloadedCurrents)
     noise = np.array([0.01, 0.02, 0.012, 0.015])
     gains = PLANAR.gains * np.array([1.01, 0.98, 1.0, 1.02])
@@ -135,7 +143,8 @@ def test_rows_and_triangles_are_the_same_equations(mechanism: Mechanism) -> None
     made = _made(mechanism.name)
     assert found.gathered is not None
     datasets, rows = found.gathered
-    again = observe(made.model, [differentiate(run, made.model.drive_train, made.conditioning) for run in made.runs],  # noqa: E501
+    runs = [differentiate(run, made.model.drive_train, made.conditioning) for run in made.runs]
+    again = observe(made.model, runs,
                     made.conditioning, found.system)  # fmt: skip
     assert again.regressor == pytest.approx(rows.regressor)
     system = rows.system()
@@ -183,12 +192,16 @@ def test_what_preload_hides_of_an_effect_is_in_no_row() -> None:
     ]
     again = [differentiate(run, made.model.drive_train, made.conditioning) for run in with_effect]
     rows = observe(made.model, again, made.conditioning, found.system)
-    seen = rows.extended((Column("effect", "Nm"),), alone).effects
+    columns = (Column("effect", "Nm"),)
+    seen = rows.extended(columns, alone).effects
     added = rows.torque(PLANAR.gains) - found.gathered[1].torque(PLANAR.gains)
     used = rows.use[0]
     # A turns within a row's window, so that the filter leaves a little.
-    assert np.linalg.norm((added - seen[:, 0])[:, used]) < 0.02 * np.linalg.norm(added[:, used])
-    assert np.linalg.norm((added - alone[:, 0])[:, used]) > 0.3 * np.linalg.norm(added[:, used])
+    added_norm = np.linalg.norm((added - seen[:, 0])[:, used])
+    assert added_norm < 0.02 * np.linalg.norm(added[:, used])
+    added_difference = added - alone[:, 0]
+    added_difference_norm = np.linalg.norm(added_difference[:, used])
+    assert added_difference_norm > 0.3 * np.linalg.norm(added[:, used])
 
 
 def _padded(inner: FloatArray) -> FloatArray:

@@ -36,11 +36,12 @@ def _of(comparison: EstimatorComparison, estimator: str) -> FloatArray:
 def test_every_estimator_is_tried_under_every_filter_the_declared_ones_first(
     noisy: EstimatorComparison,
 ) -> None:
-    assert len(noisy.trials) == len(ESTIMATORS) * len(CUTOFF_FACTORS)
-    assert {trial.position_cutoff_hz for trial in noisy.declared} == {
-        CONDITIONING.position_cutoff_hz
-    }
-    assert [trial.estimator for trial in noisy.declared] == list(ESTIMATORS)
+    expected = len(ESTIMATORS) * len(CUTOFF_FACTORS)
+    assert len(noisy.trials) == expected
+    position_cutoff_hz = {trial.position_cutoff_hz for trial in noisy.declared}
+    assert position_cutoff_hz == {CONDITIONING.position_cutoff_hz}
+    estimators = [trial.estimator for trial in noisy.declared]
+    assert estimators == list(ESTIMATORS)
 
 
 def test_gains_of_ml_depend_less_on_the_filters_than_those_of_tls(
@@ -56,8 +57,10 @@ def test_gains_of_tls_depend_on_the_weights_of_the_rows(noisy: EstimatorComparis
         for trial in noisy.declared
         if trial.gains is not None
     }
-    assert np.max(np.abs(errors["tls, rows (paper)"])) < 0.01
-    assert np.max(np.abs(errors["tls, residuals"])) > 0.05
+    paper_errors = np.abs(errors["tls, rows (paper)"])
+    assert np.max(paper_errors) < 0.01
+    residual_errors = np.abs(errors["tls, residuals"])
+    assert np.max(residual_errors) > 0.05
 
 
 def test_without_noise_all_agree(truth: Truth, clean_runs: tuple[Run, ...]) -> None:
@@ -73,5 +76,6 @@ def test_a_filter_that_the_rate_does_not_allow_fails_alone(truth: Truth) -> None
     ]
     found = try_estimators(truth.model, lambda: slow, CONDITIONING)
     assert all(trial.gains is not None for trial in found.declared)
-    assert "needs more than 200 Hz" in found.trials[-1].reason
+    last_trial = found.trials[-1]
+    assert "needs more than 200 Hz" in last_trial.reason
     assert found.spread_percent("ml") is None

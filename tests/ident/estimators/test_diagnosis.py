@@ -65,7 +65,8 @@ def clean(small_truth: Truth) -> list[Run]:
 
 @pytest.mark.parametrize("seed", range(10))
 def test_nothing_is_named_in_clean_recordings(small_truth: Truth, seed: int) -> None:
-    runs = small_recordings(small_truth, seed, count=3, noise_a=(0.02, 0.1, 0.15)[seed % 3])
+    noise_a = (0.02, 0.1, 0.15)[seed % 3]
+    runs = small_recordings(small_truth, seed, count=3, noise_a=noise_a)
     limit = np.full(3, 99.0)
     assert diagnosed(small_truth, runs[:2], runs[2:], effort_limit=limit) == ()
     assert (
@@ -78,20 +79,25 @@ def test_nothing_is_named_in_clean_recordings(small_truth: Truth, seed: int) -> 
 
 
 def test_a_payload_turned_in_one_run_of_three(small_truth: Truth) -> None:
-    runs = small_recordings(small_truth, 0, count=6, bodies={3: turned(np.pi)})
+    bodies = {3: turned(np.pi)}
+    runs = small_recordings(small_truth, 0, count=6, bodies=bodies)
     (found,) = diagnosed(small_truth, runs)
-    assert (found.name, found.runs, found.axes) == ("payload-differs", ("r3",), ())
+    expected = ("payload-differs", ("r3",), ())
+    assert (found.name, found.runs, found.axes) == expected
     assert "not turned?" in found.text
 
 
 def test_of_two_loaded_runs_neither_can_be_blamed_alone(small_truth: Truth) -> None:
-    runs = small_recordings(small_truth, 1, bodies={1: turned(np.pi)})
+    bodies = {1: turned(np.pi)}
+    runs = small_recordings(small_truth, 1, bodies=bodies)
     (found,) = diagnosed(small_truth, runs, fixed=True)
-    assert (found.name, found.runs) == ("payload-differs", ("r1", "r3"))
+    expected = ("payload-differs", ("r1", "r3"))
+    assert (found.name, found.runs) == expected
 
 
 def test_a_payload_turned_in_the_held_out_run(small_truth: Truth) -> None:
-    runs = small_recordings(small_truth, 2, bodies={3: turned(np.pi)})
+    bodies = {3: turned(np.pi)}
+    runs = small_recordings(small_truth, 2, bodies=bodies)
     (found,) = diagnosed(small_truth, runs[:2], runs[2:])
     assert (found.name, found.runs) == ("payload-differs", ("r3",))
 
@@ -113,7 +119,8 @@ def test_the_only_loaded_run_without_its_payload(small_truth: Truth) -> None:
     runs = small_recordings(small_truth, 0, count=2)
     off = np.array([1.2, 0.85, 1.1])
     assert diagnosed(small_truth, with_currents(runs, off), fixed=True) == ()
-    forgotten = [runs[0], small_recordings(small_truth, 0, count=2, bodies={1: 0.0 * BODY})[1]]
+    bodies = {1: 0.0 * BODY}
+    forgotten = [runs[0], small_recordings(small_truth, 0, count=2, bodies=bodies)[1]]
     (found,) = diagnosed(small_truth, forgotten, fixed=True)
     assert (found.name, found.runs) == ("payload-differs", ("r1",))
 
@@ -136,11 +143,11 @@ def test_the_difference_is_estimated_as_planted(small_truth: Truth) -> None:
 def test_exchanged_currents_are_named(
     small_truth: Truth, clean: list[Run], order: list[int]
 ) -> None:
-    found = exchanged_channels(small_truth.model, with_currents(clean[:2], 1.0, order), SMALL, AXES)
+    runs = with_currents(clean[:2], 1.0, order)
+    found = exchanged_channels(small_truth.model, runs, SMALL, AXES)
     assert found is not None
-    assert found.axes == tuple(
-        name for name, place in zip(AXES, order, strict=True) if AXES[place] != name
-    )
+    expected = tuple(name for name, place in zip(AXES, order, strict=True) if AXES[place] != name)
+    assert found.axes == expected
 
 
 def test_one_motor_that_explains_another_current_better_is_no_exchange(
@@ -161,7 +168,8 @@ def test_one_motor_that_explains_another_current_better_is_no_exchange(
 
 
 def test_a_reversed_current_only_turns_a_free_gain(small_truth: Truth, clean: list[Run]) -> None:
-    (found,) = diagnosed(small_truth, with_currents(clean, np.array([1.0, -1.0, 1.0])))
+    runs = with_currents(clean, np.array([1.0, -1.0, 1.0]))
+    (found,) = diagnosed(small_truth, runs)
     assert (found.name, found.axes) == ("current-reversed", ("J2",))
 
 
@@ -190,7 +198,8 @@ def test_a_reversed_current_with_fixed_gains(
 def test_a_unit_is_named(
     small_truth: Truth, clean: list[Run], current: float, mass: float, fixed: bool
 ) -> None:
-    heavy = replace(MOUNTED, known={"m": mass * MOUNTED.known["m"]})
+    known = {"m": mass * MOUNTED.known["m"]}
+    heavy = replace(MOUNTED, known=known)
     runs = [
         replace(run, payload=run.payload and heavy) for run in with_currents(clean[:2], current)
     ]
@@ -208,14 +217,16 @@ def test_a_unit_is_named(
 def test_all_gains_must_be_off_alike(ratio: list[float]) -> None:
     gains = np.array(ratio) * (-1.0) ** np.arange(len(ratio))
     if min(ratio) > UNIT_RATIO or max(ratio) < 1.0 / UNIT_RATIO:
+        nameplate = np.ones(len(ratio))
         with pytest.raises(UnitsMistaken):
-            require_units(gains, np.ones(len(ratio)))
+            require_units(gains, nameplate)
     else:
         require_units(gains, np.ones(len(ratio)))
 
 
 def test_one_gain_off_its_nameplate(small_truth: Truth, clean: list[Run]) -> None:
-    (found,) = diagnosed(small_truth, with_currents(clean, np.array([1.0, 1.0, 5.0])))
+    runs = with_currents(clean, np.array([1.0, 1.0, 5.0]))
+    (found,) = diagnosed(small_truth, runs)
     assert (found.name, found.axes) == ("gain-off-nameplate", ("J3",))
     assert "or a length of the URDF wrong? measure the lengths" in found.remedy
 
@@ -226,7 +237,8 @@ def test_torques_above_the_limits_of_the_urdf(small_truth: Truth, clean: list[Ru
     limit = np.array([99.0, np.inf, 99.0])
     (found,) = diagnosed(small_truth, runs, fixed=True, effort_limit=limit)
     assert found.name == "torque-above-limit"
-    assert diagnosed(small_truth, runs, fixed=True, effort_limit=np.full(3, np.inf)) == ()
+    effort_limit = np.full(3, np.inf)
+    assert diagnosed(small_truth, runs, fixed=True, effort_limit=effort_limit) == ()
 
 
 def test_an_error_on_one_axis(small_truth: Truth, clean: list[Run]) -> None:
@@ -236,24 +248,26 @@ def test_an_error_on_one_axis(small_truth: Truth, clean: list[Run]) -> None:
         replace(run, current_a=run.current_a + one) for run, one in zip(clean, noise, strict=True)
     ]
     (found,) = diagnosed(small_truth, noisy[:2], fixed=True)
-    assert (found.name, found.runs, found.axes) == ("axis-error", (), ("J3",))
+    expected = ("axis-error", (), ("J3",))
+    assert (found.name, found.runs, found.axes) == expected
 
 
 def test_an_error_of_a_held_out_run_is_that_runs_alone(
     small_truth: Truth, clean: list[Run]
 ) -> None:
     """The rows of a search for effects name all runs, those of the fit first."""
-    noise = np.random.default_rng(0).standard_normal(clean[2].current_a.shape) * np.array(
-        [0.0, 0.0, 1.0]
-    )
-    noisy = replace(clean[2], current_a=clean[2].current_a + noise)
+    rng = np.random.default_rng(0)
+    noise = rng.standard_normal(clean[2].current_a.shape) * np.array([0.0, 0.0, 1.0])
+    current_a = clean[2].current_a + noise
+    noisy = replace(clean[2], current_a=current_a)
     gains = small_truth.gains
     found = identify(
         small_truth.model, clean[:2], SMALL, holdout=[noisy], fixed_gains=gains, keep_rows=True
     )
     for identified in (found, gather(found).identification):
         (one,) = diagnose(identified, AXES, gains)
-        assert (one.name, one.runs, one.axes) == ("axis-error", ("r2",), ("J3",))
+        expected = ("axis-error", ("r2",), ("J3",))
+        assert (one.name, one.runs, one.axes) == expected
 
 
 def test_a_tiny_torque_is_no_error(small_truth: Truth) -> None:
@@ -262,13 +276,15 @@ def test_a_tiny_torque_is_no_error(small_truth: Truth) -> None:
     idle = idle_joints(small_truth.model, size, left)
     (found,) = axis_error_diagnoses(size, left, idle, AXES, ())
     assert (found.name, found.axes) == ("axis-idle", ("J3",))
+    runs = small_recordings(small_truth, 5, count=1)
     estimate = identify(
         small_truth.model,
-        small_recordings(small_truth, 5, count=1),
+        runs,
         SMALL,
         fixed_gains=small_truth.gains,
     ).estimate
-    error = RelativeError((3.3, 5.0, 900.0), 4.0)
+    axes = (3.3, 5.0, 900.0)
+    error = RelativeError(axes, 4.0)
     require_plausible(estimate, error, AXES, idle)
     with pytest.raises(ModelContradicted, match="900 % on axis J3"):
         require_plausible(estimate, error, AXES)
@@ -278,10 +294,11 @@ def test_axes_that_never_move_apart_leave_no_parameters(small_truth: Truth) -> N
     def tied(q: FloatArray) -> FloatArray:
         return np.column_stack((q[:, 0], q[:, 1], 0.5 * q[:, 1] + 1e-6 * q[:, 2]))
 
+    rng = np.random.default_rng(0)
     run = record(
         small_truth,
         "tied",
-        np.random.default_rng(0),
+        rng,
         seconds=16.0,
         noise_a=0.05,
         rate_hz=200.0,
@@ -300,7 +317,8 @@ def test_the_unit_of_an_effect_is_no_bad_condition(small_truth: Truth) -> None:
     assert found.gathered is not None
     _, rows = found.gathered
     effect = np.zeros((3, 1, rows.current.shape[1]))
-    effect[1, 0] = np.random.default_rng(0).standard_normal(rows.current.shape[1])
+    rng = np.random.default_rng(0)
+    effect[1, 0] = rng.standard_normal(rows.current.shape[1])
     conditions = [
         wls(
             rows.extended((Column("effect", "1"),), unit * effect).system(), small_truth.gains
@@ -323,11 +341,12 @@ def test_another_estimator_far_from_ml(small_truth: Truth, clean: list[Run]) -> 
 def test_the_instruments_need_not_agree_with_ml(small_truth: Truth, clean: list[Run]) -> None:
     """Where a disturbance moves the arm, ml is the one that is off."""
     found = identify(small_truth.model, clean, SMALL)
-    off = replace(
-        found, estimate=replace(found.estimate, method=Method.IV, gains=1.3 * found.estimate.gains)
-    )
+    gains = 1.3 * found.estimate.gains
+    changed_estimate = replace(found.estimate, method=Method.IV, gains=gains)
+    off = replace(found, estimate=changed_estimate)
     assert "estimators-disagree" not in {one.name for one in diagnose(off, AXES)}
-    other = replace(off, estimate=replace(off.estimate, method=Method.TLS))
+    estimate = replace(off.estimate, method=Method.TLS)
+    other = replace(off, estimate=estimate)
     apart = [one for one in diagnose(other, AXES) if one.name == "estimators-disagree"]
     assert apart
     assert "an effect that the model lacks" in apart[0].remedy
@@ -345,16 +364,17 @@ def limits_in(text: str) -> tuple[float, float]:
     sign=st.sampled_from([1.0, -1.0]),
 )
 def test_the_scale_of_a_current_beside_a_calibration(scale: float, sign: float) -> None:
-    predicted = np.random.default_rng(0).standard_normal((2, 200))
+    rng = np.random.default_rng(0)
+    predicted = rng.standard_normal((2, 200))
     measured = predicted * np.array([[1.0], [sign * scale]])
-    found = {
-        one.name: one
-        for one in scale_diagnoses(measured, predicted, np.ones((2, 200), dtype=bool), "ab", ("r",))
-    }
+    use = np.ones((2, 200), dtype=bool)
+    found = {one.name: one for one in scale_diagnoses(measured, predicted, use, "ab", ("r",))}
     assert ("current-reversed" in found) == (sign < 0.0)
-    assert ("current-off-scale" in found) == (not 0.7 <= scale <= 1.3)
+    expected = not 0.7 <= scale <= 1.3
+    assert ("current-off-scale" in found) == expected
     if "current-off-scale" in found:
-        assert limits_in(found["current-off-scale"].expected) == (0.7, 1.3)
+        text = found["current-off-scale"].expected
+        assert limits_in(text) == (0.7, 1.3)
         assert found["current-off-scale"].axes == ("b",)
 
 
@@ -362,12 +382,12 @@ def test_noise_makes_no_scale(small_truth: Truth) -> None:
     """Twenty times the same torque, at 1.3 of the prediction,
     with noise of a seventh of its size.
     """
-    predicted = np.random.default_rng(0).standard_normal((1, 400))
+    rng = np.random.default_rng(0)
+    predicted = rng.standard_normal((1, 400))
     for seed in range(1, 21):
         measured = 1.3 * predicted + 0.15 * np.random.default_rng(seed).standard_normal((1, 400))
-        assert not list(
-            scale_diagnoses(measured, predicted, np.ones((1, 400), dtype=bool), "a", ("r",))
-        )
+        use = np.ones((1, 400), dtype=bool)
+        assert not list(scale_diagnoses(measured, predicted, use, "a", ("r",)))
 
 
 @given(
@@ -378,7 +398,8 @@ def test_noise_makes_no_scale(small_truth: Truth) -> None:
 def test_a_gain_is_named_where_the_text_says(ratio: float, std: float, sign: float) -> None:
     """Outside the range that the text has, by more than the σ that it has."""
     nameplate = np.array([sign * 20.0])
-    estimate = an_estimate(ratio * nameplate, std * np.abs(nameplate))
+    gains = ratio * nameplate
+    estimate = an_estimate(gains, std * np.abs(nameplate))
     found = [
         one
         for one in gain_diagnoses(estimate, nameplate, ("J1",))
@@ -406,12 +427,10 @@ def test_a_gain_is_named_where_the_text_says(ratio: float, std: float, sign: flo
 def test_a_gain_that_the_moves_hardly_show_is_named_where_its_number_is_absurd(
     gain: float, std: float, is_named: bool
 ) -> None:
-    estimate = an_estimate(np.array([gain]), np.array([std]))
-    found = [
-        one
-        for one in gain_diagnoses(estimate, np.array([38.0]), ("J1",))
-        if one.name == GAIN_UNSEEN
-    ]
+    gains = np.array([gain])
+    estimate = an_estimate(gains, np.array([std]))
+    nameplate = np.array([38.0])
+    found = [one for one in gain_diagnoses(estimate, nameplate, ("J1",)) if one.name == GAIN_UNSEEN]
     assert bool(found) == is_named
     for one in found:
         assert one.axes == ("J1",)
@@ -422,21 +441,27 @@ def test_the_papers_gains_are_not_off_their_nameplates() -> None:
     """J4 in Tables 2 and 4: up to 30 % below the nameplate of 11.52, with σ of 2 to 3 %."""
     nameplate = np.array([-11.52])
     for gain, percent in ((-8.06, 3.33), (-8.27, 1.76), (-8.31, 1.99), (-9.21, 2.75)):
-        estimate = an_estimate(np.array([gain]), np.array([percent / 100.0 * abs(gain)]))
+        std = np.array([percent / 100.0 * abs(gain)])
+        gains = np.array([gain])
+        estimate = an_estimate(gains, std)
         assert not list(gain_diagnoses(estimate, nameplate, ("J4",)))
 
 
 def an_estimate(gains: FloatArray, std: FloatArray) -> Estimate:
     """An estimate of gains alone."""
+    covariance = np.diag(std**2)
+    axis_noise = np.ones(len(gains))
+    parameters = np.zeros(0)
+    singular_values = np.ones(1)
     return Estimate(
         method=Method.ML,
         gains=gains,
         gains_fixed=False,
         unknowns=(),
-        parameters=np.zeros(0),
-        covariance=np.diag(std**2),
-        axis_noise=np.ones(len(gains)),
-        singular_values=np.ones(1),
+        parameters=parameters,
+        covariance=covariance,
+        axis_noise=axis_noise,
+        singular_values=singular_values,
         condition=1.0,
         rows=9,
     )
@@ -444,15 +469,18 @@ def an_estimate(gains: FloatArray, std: FloatArray) -> Estimate:
 
 def test_ranges_in_texts_are_those_that_are_tested(small_truth: Truth, clean: list[Run]) -> None:
     """A factor that a refusal names is the one that it tests."""
+    gains = np.full(3, 1.01 * UNIT_RATIO)
     with pytest.raises(
         UnitsMistaken,
         match=rf"0\.7 to 1\.3, and within a factor of {UNIT_RATIO:g} "
         r"on one axis",
     ):
-        require_units(np.full(3, 1.01 * UNIT_RATIO), np.ones(3))
-    forgotten = [clean[0], small_recordings(small_truth, 0, count=2, bodies={1: 0.0 * BODY})[1]]
+        require_units(gains, np.ones(3))
+    bodies = {1: 0.0 * BODY}
+    forgotten = [clean[0], small_recordings(small_truth, 0, count=2, bodies=bodies)[1]]
     (found,) = diagnosed(small_truth, forgotten, fixed=True)
-    assert found.expected == f"1, and within a factor of {WEIGHT_RATIO:g}"
+    expected = f"1, and within a factor of {WEIGHT_RATIO:g}"
+    assert found.expected == expected
 
 
 @pytest.mark.parametrize("factor", [0.51, 2.0])
@@ -460,7 +488,8 @@ def test_a_current_in_another_ampere_is_named(
     small_truth: Truth, clean: list[Run], factor: float
 ) -> None:
     """A torque constant that is applied twice, or an ampere that is a peak value of two."""
-    (found,) = diagnosed(small_truth, with_currents(clean, np.array([1.0, factor, 1.0])))
+    runs = with_currents(clean, np.array([1.0, factor, 1.0]))
+    (found,) = diagnosed(small_truth, runs)
     assert (found.name, found.axes) == ("gain-off-nameplate", ("J2",))
     ratio = re.search(r"([0-9.]+) times the nameplate$", found.found)
     assert ratio is not None
@@ -473,8 +502,10 @@ def test_the_axis_whose_friction_jumps_through_zero_is_found_by_its_equation(
     """Without noise, and at 200 Hz, the current of J3 is near zero in two samples of 16 s."""
     runs = small_recordings(small_truth, 3, count=1, noise_a=0.0)
     assert unsigned_channels(small_truth.model, runs, SMALL, AXES) is None
-    size = np.abs(runs[0].current_a[:, 2])
-    sized = [replace(runs[0], current_a=np.column_stack((runs[0].current_a[:, :2], size)))]
+    current_a = runs[0].current_a
+    size = np.abs(current_a[:, 2])
+    stacked_current_a = np.column_stack((runs[0].current_a[:, :2], size))
+    sized = [replace(runs[0], current_a=stacked_current_a)]
     assert not any(
         unsigned_currents(run, small_truth.model.drive_train.ratio).any() for run in sized
     )
@@ -506,23 +537,31 @@ def _pendulum_run() -> Run:
     velocity = np.gradient(position, time_s)
     acceleration = np.gradient(velocity, time_s)
     current = np.sin(position) + 0.005 * acceleration + 0.02 * np.sign(np.round(velocity, 3))
-    current = current + 1e-3 * np.random.default_rng(1).standard_normal(len(current))
+    rng = np.random.default_rng(1)
+    current = current + 1e-3 * rng.standard_normal(len(current))
     return Run("lifts", time_s, position[:, None], current[:, None])
 
 
 def test_a_load_that_is_always_carried_is_explained_by_the_equation_of_its_motor() -> None:
-    link = Joint("J1", JointKind.REVOLUTE, -1, np.eye(3), np.zeros(3), np.array([0.0, 0.0, 1.0]))
-    pendulum = Model(Robot((link,), np.array([0.0, -9.81, 0.0])), DriveTrain(np.eye(1)))
+    rotation = np.eye(3)
+    translation_m = np.zeros(3)
+    link = Joint("J1", JointKind.REVOLUTE, -1, rotation, translation_m, np.array([0.0, 0.0, 1.0]))
+    gravity_m_s2 = np.array([0.0, -9.81, 0.0])
+    robot = Robot((link,), gravity_m_s2)
+    drive_train = DriveTrain(np.eye(1))
+    pendulum = Model(robot, drive_train)
     conditioning = Conditioning(standstill_rad_s=(0.03,))
     run = _pendulum_run()
-    assert unsigned_currents(run, np.eye(1)).all()  # by its shape alone it would be called a size
+    ratio = np.eye(1)
+    assert unsigned_currents(run, ratio).all()  # by its shape alone it would be called a size
     require_explained_currents(run, pendulum, conditioning, ("J1",))
 
 
 def test_a_size_is_refused_whatever_its_load(small_truth: Truth) -> None:
     """The sizes of the currents of an arm, which its equations do not explain."""
     (run,) = small_recordings(small_truth, 3, count=1)
-    sizes = replace(run, current_a=np.abs(run.current_a))
+    current_a = np.abs(run.current_a)
+    sizes = replace(run, current_a=current_a)
     with pytest.raises(CurrentUnsigned, match="J1, J2, J3"):
         require_explained_currents(sizes, small_truth.model, SMALL, AXES)
 
@@ -532,6 +571,7 @@ def test_a_recording_is_judged_alike_whatever_the_method(
     small_truth: Truth, clean: list[Run], method: Method
 ) -> None:
     """The estimator is named for what it makes of the noise, the recording for its mistake."""
-    found = diagnosed(small_truth, with_currents(clean, np.array([1.0, 0.51, 1.0])), method=method)
+    runs = with_currents(clean, np.array([1.0, 0.51, 1.0]))
+    found = diagnosed(small_truth, runs, method=method)
     by_ml = diagnosed(small_truth, with_currents(clean, np.array([1.0, 0.51, 1.0])))
     assert tuple(one for one in found if one.name != "estimators-disagree") == by_ml

@@ -43,17 +43,20 @@ COUNT_RAD = 2.0 * np.pi / (65536 * 5)
 @cache
 def _exact(seed: int) -> FloatArray:
     """Positions of the motors that the closures allow."""
-    return axis_positions(PLANAR, np.random.default_rng(seed), SECONDS)
+    rng = np.random.default_rng(seed)
+    return axis_positions(PLANAR, rng, SECONDS)
 
 
 def _run(position_rad: FloatArray) -> Run:
     time_s = np.arange(len(position_rad)) / RATE_HZ
-    return Run("run", time_s, position_rad, np.zeros_like(position_rad))
+    current_a = np.zeros_like(position_rad)
+    return Run("run", time_s, position_rad, current_a)
 
 
 def _noise(seed: int, shape: tuple[int, ...], correlation_s: float = 0.0) -> FloatArray:
     """Draw noise of σ = 1: white, or that decays over a time."""
-    white = np.random.default_rng(100 + seed).standard_normal(shape)
+    rng = np.random.default_rng(100 + seed)
+    white = rng.standard_normal(shape)
     if correlation_s == 0.0:
         return white
     kept = np.exp(-1.0 / (RATE_HZ * correlation_s))
@@ -71,9 +74,9 @@ def _found(
     if position_rad is None:
         exact = _exact(seed)
         position_rad = exact + NOISE_RAD * _noise(seed, exact.shape)
-    found = estimate_geometry(
-        model_with_geometry(PLANAR.model, changes), (thinned(_run(position_rad)),)
-    )
+    runs = (thinned(_run(position_rad)),)
+    model = model_with_geometry(PLANAR.model, changes)
+    found = estimate_geometry(model, runs)
     assert found is not None
     return found
 
@@ -91,7 +94,8 @@ def test_a_wrong_zero_is_named(degrees: float) -> None:
     found = _found((PARAMETERS[1], np.radians(degrees)))
     assert _is_named(found, PARAMETERS[1], -np.radians(degrees))
     assert found.corrections == found.causes
-    assert found.corrections[0].std < np.radians(1e-3)
+    std = found.corrections[0].std
+    assert std < np.radians(1e-3)
     assert found.alternatives == ()
     assert found.noise == pytest.approx(NOISE_RAD, rel=0.2)
 
@@ -104,12 +108,15 @@ def test_a_wrong_length_is_named(number: int, share: float) -> None:
 
 def test_two_wrong_numbers_are_named_together() -> None:
     found = _found((PARAMETERS[0], 2e-3), (PARAMETERS[10], -4e-4))
-    assert {one.parameter for one in found.corrections} == {PARAMETERS[0], PARAMETERS[10]}
+    expected = {PARAMETERS[0], PARAMETERS[10]}
+    parameters = {one.parameter for one in found.corrections}
+    assert parameters == expected
     assert found.changes[0].change == found.corrections[0].change
     assert found.covariance.shape == (2, 2)
     for one in found.corrections:
         wrong = {PARAMETERS[0]: 2e-3, PARAMETERS[10]: -4e-4}[one.parameter]
-        assert abs(one.change + wrong) < 4.0 * one.std
+        absolute_change = abs(one.change + wrong)
+        assert absolute_change < 4.0 * one.std
 
 
 @pytest.mark.parametrize("parameter", [X_OF_FIRST, Y_OF_SECOND])
@@ -128,7 +135,8 @@ def test_a_late_encoder_is_named_and_nothing_is_corrected_for_it(delay_s: float)
     on_time = scipy.interpolate.CubicSpline(time_s, position_rad[:, 1])
     position_rad[:, 1] = on_time(time_s - delay_s)
     found = _found(position_rad=position_rad + NOISE_RAD * _noise(1, position_rad.shape))
-    assert _is_named(found, encoder_delays(PLANAR.robot)[1], delay_s)
+    parameter = encoder_delays(PLANAR.robot)[1]
+    assert _is_named(found, parameter, delay_s)
     assert found.corrections == ()
     assert found.changes == ()
 
@@ -143,7 +151,8 @@ def test_arms_that_bend_are_no_wrong_numbers(seed: int, axes: tuple[float, ...])
     """
     exact = _exact(seed)
     bend_rad = 2e-4 * np.sin(3.0 * exact[:, [0]]) * np.array(axes)
-    found = _found(position_rad=exact + bend_rad + NOISE_RAD * _noise(seed, exact.shape), seed=seed)
+    position_rad = exact + bend_rad + NOISE_RAD * _noise(seed, exact.shape)
+    found = _found(position_rad=position_rad, seed=seed)
     assert found.is_significant
     assert found.causes == ()
     assert found.corrections == ()
@@ -178,13 +187,16 @@ def test_deviations_are_those_of_the_noise(correlation_s: float) -> None:
     """
     scaled: list[float] = []
     for draw in range(DRAWS):
-        exact = _exact(1 + draw % 3)
+        seed = 1 + draw % 3
+        exact = _exact(seed)
         noise = NOISE_RAD * _noise(draw, exact.shape, correlation_s)
-        found = _found(position_rad=exact + noise)
+        position_rad = exact + noise
+        found = _found(position_rad=position_rad)
         assert not found.is_significant
         scaled += [one.change / one.std for one in found.every if np.isfinite(one.std)]
     assert len(scaled) > 6 * DRAWS
-    assert 0.8 < np.sqrt(np.mean(np.square(scaled))) < 1.2
+    mean_squared_scaled = np.mean(np.square(scaled))
+    assert 0.8 < np.sqrt(mean_squared_scaled) < 1.2
 
 
 @pytest.mark.parametrize("correlation_s", [0.02, 0.1, 0.5])
@@ -194,22 +206,26 @@ def test_slow_noise_hides_no_wrong_zero(correlation_s: float) -> None:
     found = _found((PARAMETERS[1], 1e-3), position_rad=noisy)
     (correction,) = found.corrections
     assert correction.parameter == PARAMETERS[1]
-    assert abs(correction.change + 1e-3) < 3.0 * correction.std
+    absolute_change = abs(correction.change + 1e-3)
+    assert absolute_change < 3.0 * correction.std
     assert found.noise < 0.5 * NOISE_RAD  # what neighbouring samples show of it
 
 
 @pytest.mark.parametrize("share", [1.0, 0.002])
 def test_rounding_to_counts_is_noise(share: float) -> None:
     """Also of axes so slow that neighbouring samples have the same count."""
-    exact = axis_positions(PLANAR, np.random.default_rng(1), SECONDS, share)
-    found = _found(position_rad=COUNT_RAD * np.round(exact / COUNT_RAD))
+    rng = np.random.default_rng(1)
+    exact = axis_positions(PLANAR, rng, SECONDS, share)
+    position_rad = COUNT_RAD * np.round(exact / COUNT_RAD)
+    found = _found(position_rad=position_rad)
     assert not found.is_significant
     assert found.noise == pytest.approx(COUNT_RAD / np.sqrt(12.0), rel=0.15)
 
 
 def test_a_count_below_what_bends_a_gain_says_nothing() -> None:
     exact = _exact(1)
-    found = _found((PARAMETERS[1], 1e-5), position_rad=exact + 1e-8 * _noise(1, exact.shape))
+    position_rad = exact + 1e-8 * _noise(1, exact.shape)
+    found = _found((PARAMETERS[1], 1e-5), position_rad=position_rad)
     assert not found.is_significant
 
 
@@ -219,8 +235,11 @@ def test_encoders_that_no_pose_fits_are_refused() -> None:
 
 
 def test_without_redundant_encoders_or_positions_nothing_is_said() -> None:
-    assert estimate_geometry(FIVE_BAR.model, (thinned(_run(np.zeros((1000, 2)))),)) is None
-    assert estimate_geometry(PLANAR.model, (thinned(_run(_exact(1)[:200])),)) is None
+    position_rad = np.zeros((1000, 2))
+    run = _run(position_rad)
+    assert estimate_geometry(FIVE_BAR.model, (thinned(run),)) is None
+    runs = (thinned(_run(_exact(1)[:200])),)
+    assert estimate_geometry(PLANAR.model, runs) is None
     assert estimate_geometry(PLANAR.model, (thinned(_run(_exact(1)[:4])),)) is None
 
 
@@ -228,16 +247,22 @@ def test_positions_are_thinned_where_every_axis_is_valid() -> None:
     q = np.arange(1000.0)[:, None] * np.ones(4)
     valid = np.ones(q.shape, dtype=np.bool_)
     valid[40, 2] = False
-    run = Run("run", np.arange(1000) / 500.0, q, np.zeros_like(q), valid=valid)
+    time_s = np.arange(1000) / 500.0
+    current_a = np.zeros_like(q)
+    run = Run("run", time_s, q, current_a, valid=valid)
     found = thinned(run)
     # Ten samples on either side belong to a position.
-    assert list(found.position_rad[:4, 0]) == [10.0, 20.0, 60.0, 70.0]
-    assert list(found.before_rad[:2, 0]) == [9.0, 19.0]
-    assert list(found.after_rad[:2, 0]) == [11.0, 21.0]
+    position_rad = list(found.position_rad[:4, 0])
+    assert position_rad == [10.0, 20.0, 60.0, 70.0]
+    before_rad = list(found.before_rad[:2, 0])
+    assert before_rad == [9.0, 19.0]
+    after_rad = list(found.after_rad[:2, 0])
+    assert after_rad == [11.0, 21.0]
     assert np.allclose(found.motion[:, :, 0], 500.0)
     assert np.allclose(found.motion[:, :, 1:] * 0.02 ** np.arange(2, 5), 0.0, atol=1e-6)
     assert np.allclose(found.count_rad, 1.0)
-    assert len(thinned(replace(run, valid=None)).position_rad) == 98
+    changed_run = replace(run, valid=None)
+    assert len(thinned(changed_run).position_rad) == 98
 
 
 def test_a_place_on_the_base_is_one_of_its_coordinates() -> None:
@@ -249,4 +274,5 @@ def test_a_place_on_the_base_is_one_of_its_coordinates() -> None:
             shift = [0.0, 0.002, 0.0]
         else:
             shift = [0.0, 0.0, 0.0]
-        assert np.allclose(joint.translation_m - before[joint.name], shift, atol=1e-15)
+        translation_difference_m = joint.translation_m - before[joint.name]
+        assert np.allclose(translation_difference_m, shift, atol=1e-15)

@@ -53,13 +53,14 @@ def test_iv_solves_the_equations_of_its_instruments(disturbed: tuple[Identificat
         )
         error = recorded[:, 0] - (recorded[:, 1:-1] @ estimate.parameters + recorded[:, -1]) / gain
         predicted = (instrument[:, 1:-1] @ estimate.parameters + instrument[:, -1]) / gain
-        assert abs(predicted @ error) < 1e-5 * np.linalg.norm(predicted) * np.linalg.norm(error)
+        predicted_norm = np.linalg.norm(predicted)
+        error_norm = np.linalg.norm(error)
+        assert abs(predicted @ error) < 1e-5 * predicted_norm * error_norm
         residual = recorded[:, 0] - predicted
         weight = len(error) / (gain * float(residual @ residual))
         sums.append(weight * (instrument[:, 1:-1].T @ error))
-        sizes.append(
-            abs(weight) * np.linalg.norm(instrument[:, 1:-1], axis=0) * np.linalg.norm(error)
-        )
+        instrument_norm = np.linalg.norm(instrument[:, 1:-1], axis=0)
+        sizes.append(abs(weight) * instrument_norm * np.linalg.norm(error))
     columns = np.sum(sums, axis=0)
     size = np.sum(sizes, axis=0)
     # σ counts the free unknowns of all motors alike, hence the hundredth.
@@ -79,13 +80,15 @@ def test_the_loop_bends_ml_and_not_iv(small_truth: Truth) -> None:
             estimate = identify(small_truth.model, runs, THREE, method=method).estimate
             names = [column.name for column in estimate.unknowns]
             at = [names.index(name) for name in BENT]
-            true = [
-                small_truth.parameters[
-                    [column.name for column in small_truth.model.columns].index(name)
-                ]
-                for name in BENT
-            ]
-            scores.append(((estimate.parameters[at] - true) / estimate.parameters_std[at]).tolist())
+            true = []
+            for name in BENT:
+                true.append(
+                    small_truth.parameters[
+                        [column.name for column in small_truth.model.columns].index(name)
+                    ]
+                )
+            parameter_difference = estimate.parameters[at] - true
+            scores.append((parameter_difference / estimate.parameters_std[at]).tolist())
     mean = {method: np.mean(scores, axis=0) for method, scores in z.items()}
     noise = 1.0 / np.sqrt(SEEDS)
     assert np.all(mean["ml"] < -3.0 * noise)
@@ -107,10 +110,12 @@ def test_instruments_of_rows_are_those_of_the_reduction(small_truth: Truth) -> N
     assert again is not None
     assert again.gains == pytest.approx(found.estimate.gains, rel=1e-6)
     assert again.gains_std == pytest.approx(found.estimate.gains_std, rel=1e-3)
-    joined = by_instruments(with_effects(evidence, (PlacedEffect(LoadFriction(0), 1),)))
+    effects = (PlacedEffect(LoadFriction(0), 1),)
+    joined = by_instruments(with_effects(evidence, effects))
     assert joined is not None
     assert joined.method is Method.IV
-    assert len(joined.parameters) == len(found.estimate.parameters) + 1
+    expected = len(found.estimate.parameters) + 1
+    assert len(joined.parameters) == expected
 
 
 def test_continuous_motion_has_no_instruments(small_truth: Truth) -> None:

@@ -68,8 +68,10 @@ def _small_system(truth: Truth, seed: int, noise_a: float) -> System:
         )
         for number in range(4)
     ]
-    conditioning = replace(CONDITIONING, standstill_rad_s=(0.03,) * 3)
-    return regrouped(reduce_runs(truth.model, runs, conditioning))
+    standstill_rad_s = (0.03,) * 3
+    conditioning = replace(CONDITIONING, standstill_rad_s=standstill_rad_s)
+    standard = reduce_runs(truth.model, runs, conditioning)
+    return regrouped(standard)
 
 
 def _mean_error(gains: FloatArray, truth: Truth) -> float:
@@ -77,12 +79,14 @@ def _mean_error(gains: FloatArray, truth: Truth) -> float:
 
 
 def test_joint_data_std_is_equation_22_on_the_rows_of_the_joint(noisy: Evidence) -> None:
-    found = joint_data_std(noisy.training.system().joints)
+    triangles = noisy.training.system().joints
+    found = joint_data_std(triangles)
     for joint in range(6):
         rows = _rows_of_joint(noisy, joint)
         own = rows[:, _in_turn_independent(rows)]
         smallest = np.linalg.svd(own, compute_uv=False)[-1]
-        assert found[joint] == pytest.approx(smallest / np.sqrt(len(rows) - own.shape[1]), rel=1e-6)
+        row_count_root = np.sqrt(len(rows) - own.shape[1])
+        assert found[joint] == pytest.approx(smallest / row_count_root, rel=1e-6)
 
 
 def test_joint_data_std_with_absent_and_dependent_columns_is_that_of_the_others() -> None:
@@ -95,8 +99,11 @@ def test_joint_data_std_with_absent_and_dependent_columns_is_that_of_the_others(
     dependent = full[:, :1] - 3.0 * full[:, 1:2]
     more = np.concatenate((full, absent, negligible, dependent), axis=1)
     rows = np.array([ROWS])
-    found = joint_data_std(Triangles((triangle((more,), more.shape[1]),), rows))
-    expected = np.linalg.svd(full, compute_uv=False)[-1] / np.sqrt(ROWS - 4)
+    columns = more.shape[1]
+    factors = (triangle((more,), columns),)
+    found = joint_data_std(Triangles(factors, rows))
+    rows_root = np.sqrt(ROWS - 4)
+    expected = np.linalg.svd(full, compute_uv=False)[-1] / rows_root
     assert found == pytest.approx([expected], rel=1e-9)
     assert expected == pytest.approx(0.1, rel=0.1)
 
@@ -104,7 +111,9 @@ def test_joint_data_std_with_absent_and_dependent_columns_is_that_of_the_others(
 def test_joint_data_std_without_rows_is_infinite_so_that_the_joint_has_no_weight() -> None:
     resting = np.zeros((3, 3))
     moving = np.array([[1.0, 0.0, 1.0], [0.0, 1.0, 1.0], [0.0, 0.0, 0.1]])
-    found = joint_data_std(Triangles((resting, moving), np.array([0, 9])))
+    rows = np.array([0, 9])
+    triangles = Triangles((resting, moving), rows)
+    found = joint_data_std(triangles)
     assert found[0] == np.inf
     assert np.isfinite(found[1])
 
@@ -113,13 +122,15 @@ def test_joint_data_std_without_rows_is_infinite_so_that_the_joint_has_no_weight
 def test_joint_data_std_follows_the_noise_of_the_current_and_not_the_gain(
     small_truth: Truth, axis: int
 ) -> None:
-    quiet = joint_data_std(_small_system(small_truth, 1, NOISE_A).joints)
+    triangles = _small_system(small_truth, 1, NOISE_A).joints
+    quiet = joint_data_std(triangles)
     # The same noise on three axes whose gains are different
     assert quiet == pytest.approx(quiet.mean(), rel=0.1)
     other_gains = small_truth.gains.copy()
     other_gains[axis] *= 2.0
     stronger = replace(small_truth, gains=other_gains)
-    found = joint_data_std(_small_system(stronger, 1, NOISE_A).joints)
+    joints = _small_system(stronger, 1, NOISE_A).joints
+    found = joint_data_std(joints)
     assert found[axis] == pytest.approx(quiet[axis], rel=0.05)
 
 
@@ -127,7 +138,8 @@ def test_tls_with_noise_in_the_currents_is_as_good_as_ml(small_truth: Truth) -> 
     errors: dict[str, list[float]] = {"ml": [], "tls": [], "residuals": []}
     for seed in range(1, 5):
         system = _small_system(small_truth, seed, NOISE_A)
-        errors["ml"].append(_mean_error(ml(system).gains, small_truth))
+        gains = ml(system).gains
+        errors["ml"].append(_mean_error(gains, small_truth))
         errors["tls"].append(_mean_error(tls(system).gains, small_truth))
         errors["residuals"].append(_mean_error(tls(system, Scaling.RESIDUALS).gains, small_truth))
     means = {name: float(np.mean(values)) for name, values in errors.items()}
@@ -144,7 +156,8 @@ def test_joint_error_std_is_that_of_the_joint_alone(noisy: Evidence) -> None:
         columns = rows[:, 6:-1]
         own = columns[:, _in_turn_independent(columns)]
         error = np.linalg.norm(torque - own @ np.linalg.lstsq(own, torque, rcond=None)[0])
-        assert found[joint] == pytest.approx(error / np.sqrt(len(rows) - own.shape[1]), rel=1e-6)
+        row_count_root = np.sqrt(len(rows) - own.shape[1])
+        assert found[joint] == pytest.approx(error / row_count_root, rel=1e-6)
 
 
 def test_wls_of_fixed_gains_weights_by_the_error_of_the_joint_alone(
@@ -155,7 +168,8 @@ def test_wls_of_fixed_gains_weights_by_the_error_of_the_joint_alone(
     matrix = system.joints.stacked(weight)
     torque = matrix[:, :6] @ GAINS + matrix[:, -1]
     expected = np.linalg.lstsq(-matrix[:, 6:-1], torque, rcond=None)[0]
-    assert wls(system, GAINS).parameters == pytest.approx(expected, rel=1e-6, abs=1e-8)
+    parameters = wls(system, GAINS).parameters
+    assert parameters == pytest.approx(expected, rel=1e-6, abs=1e-8)
 
 
 def test_a_wrist_has_no_torque_of_the_known_mass_so_free_gains_take_the_global_error(
@@ -167,14 +181,16 @@ def test_a_wrist_has_no_torque_of_the_known_mass_so_free_gains_take_the_global_e
     weight = 1.0 / ls(system).axis_noise
     matrix = system.joints.stacked(weight)
     expected = np.linalg.lstsq(matrix[:, :-1], -matrix[:, -1], rcond=None)[0]
-    assert wls(system).gains == pytest.approx(expected[:6], rel=1e-6)
+    gains = wls(system).gains
+    assert gains == pytest.approx(expected[:6], rel=1e-6)
 
 
 def test_tls_of_runs_in_another_order_is_the_same(
     truth: Truth, noisy_runs: tuple[Run, ...]
 ) -> None:
     def gains(runs: tuple[Run, ...]) -> FloatArray:
-        return tls(regrouped(reduce_runs(truth.model, runs, CONDITIONING))).gains
+        standard = reduce_runs(truth.model, runs, CONDITIONING)
+        return tls(regrouped(standard)).gains
 
     assert gains(noisy_runs[::-1]) == pytest.approx(gains(noisy_runs), rel=1e-9)
 
@@ -190,12 +206,14 @@ def _with_twin_column(system: System, difference: float) -> System:
         own_row = np.zeros((1, factor.shape[1] + 1))
         if joint == 0:
             norms = np.linalg.norm(factor, axis=0)
-            largest = count + int(np.argmax(norms[count:-1]))
+            worst_joint = np.argmax(norms[count:-1])
+            largest = count + int(worst_joint)
             twin = factor[:, [largest]]
             own_row[0, -2] = difference * norms[largest]
         wider = np.concatenate((factor[:, :-1], twin, factor[:, -1:]), axis=1)
         factors.append(np.concatenate((wider, own_row)))
-    return replace(system, joints=replace(system.joints, factors=tuple(factors)))
+    joints = replace(system.joints, factors=tuple(factors))
+    return replace(system, joints=joints)
 
 
 @pytest.mark.parametrize(("difference", "expected"), [(1e-2, ()), (1e-4, (0,))])
@@ -209,7 +227,8 @@ def test_misjudged_joints_with_a_parameter_that_hardly_shows_names_its_joint(
 def test_misjudged_joints_of_usual_recordings_is_empty(
     small_truth: Truth, noisy_found: Identification
 ) -> None:
-    assert misjudged_joints(_small_system(small_truth, 1, NOISE_A)) == ()
+    system = _small_system(small_truth, 1, NOISE_A)
+    assert misjudged_joints(system) == ()
     assert misjudged_joints(noisy_found.system) == ()
 
 
@@ -221,11 +240,12 @@ def test_misjudged_joints_with_currents_in_milliampere_names_a_joint_whose_gain_
     (21) takes the noise for one of every column, and parameters are then larger numbers than gains.
     """
     system = _small_system(small_truth, 1, NOISE_A)
-    scale = np.ones(system.joints.factors[0].shape[1])
+    first_factor = system.joints.factors[0]
+    scale = np.ones(first_factor.shape[1])
     scale[: system.axis_count] = 1000.0
     factors = tuple(factor * scale for factor in system.joints.factors)
-    in_milliampere = replace(system, joints=replace(system.joints, factors=factors))
+    joints = replace(system.joints, factors=factors)
+    in_milliampere = replace(system, joints=joints)
     assert 0 in misjudged_joints(in_milliampere)
-    assert _mean_error(1000.0 * tls(in_milliampere).gains, small_truth) > 3.0 * _mean_error(
-        tls(system).gains, small_truth
-    )
+    gains = 1000.0 * tls(in_milliampere).gains
+    assert _mean_error(gains, small_truth) > 3.0 * _mean_error(tls(system).gains, small_truth)

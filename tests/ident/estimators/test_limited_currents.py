@@ -62,21 +62,24 @@ def test_a_drive_that_gives_less_is_named_and_its_samples_are_left_out(runs: lis
     found = fitted(used)
     named = limits_named(found)
     assert {axis for one in named for axis in one.axes} == {AXES[AXIS]}
-    assert found.channels[-1].torque_limits[AXIS] == pytest.approx(limit_a, rel=0.12)
+    torque_limits = found.channels[-1].torque_limits
+    assert torque_limits[AXIS] == pytest.approx(limit_a, rel=0.12)
     with_all = fitted(used, keep_rows=False)
     error, before = (
         abs(one.estimate.gains[AXIS] / TRUTH.gains[AXIS] - 1.0) for one in (found, with_all)
     )
     assert before > 0.02
     assert error < 0.5 * before
-    z = (found.estimate.gains - TRUTH.gains) / found.estimate.gains_std
+    gain_difference = found.estimate.gains - TRUTH.gains
+    z = gain_difference / found.estimate.gains_std
     assert np.abs(z).max() < 3.0
 
 
 def test_recordings_without_a_limit_have_none(runs: list[Run]) -> None:
     found = fitted(runs)
     assert limits_named(found) == []
-    assert np.isnan(found.channels[0].torque_limits).all()
+    torque_limits = found.channels[0].torque_limits
+    assert np.isnan(torque_limits).all()
 
 
 def test_a_blow_is_no_limit(runs: list[Run]) -> None:

@@ -35,23 +35,25 @@ def undeclared(truth: Truth) -> tuple[Run, ...]:
 def test_mounted_in_every_run_but_declared_absent(
     truth: Truth, noisy_runs: tuple[Run, ...], undeclared: tuple[Run, ...]
 ) -> None:
+    runs = (*undeclared, noisy_runs[1], noisy_runs[3])
     with pytest.raises(PayloadUnseen, match="mounted in every loaded run") as caught:
-        identify(truth.model, (*undeclared, noisy_runs[1], noisy_runs[3]), CONDITIONING)
+        identify(truth.model, runs, CONDITIONING)
     assert min(caught.value.std_percent) > 50.0
 
 
 def test_mounted_in_one_of_two_runs_declared_unloaded(
     truth: Truth, noisy_runs: tuple[Run, ...], undeclared: tuple[Run, ...]
 ) -> None:
+    runs = (undeclared[0], *noisy_runs[1:])
     with pytest.raises(PayloadUnseen, match="undeclared0"):
-        identify(truth.model, (undeclared[0], *noisy_runs[1:]), CONDITIONING)
+        identify(truth.model, runs, CONDITIONING)
 
 
 def test_forgotten_in_a_run_declared_loaded(truth: Truth, noisy_runs: tuple[Run, ...]) -> None:
+    changed_noisy_run = replace(noisy_runs[0], payload=MOUNTED)
+    runs = (changed_noisy_run, *noisy_runs[1:3])
     with pytest.raises(PayloadUnseen):
-        identify(
-            truth.model, (replace(noisy_runs[0], payload=MOUNTED), *noisy_runs[1:3]), CONDITIONING
-        )
+        identify(truth.model, runs, CONDITIONING)
 
 
 def test_exchanged_roles_turn_every_sign_and_friction_shows_it(
@@ -68,7 +70,8 @@ def test_exchanged_roles_turn_every_sign_and_friction_shows_it(
         r"exchanged",
     ):
         identify(truth.model, exchanged, CONDITIONING)
-    estimate = ml(regrouped(reduce_runs(truth.model, exchanged, CONDITIONING)))
+    standard = reduce_runs(truth.model, exchanged, CONDITIONING)
+    estimate = ml(regrouped(standard))
     assert estimate.gains == pytest.approx(-GAINS, rel=0.05)
 
 
@@ -81,9 +84,8 @@ def test_currents_of_another_sign_are_no_exchanged_roles(
     signs = np.array([1.0, -1.0, -1.0, 1.0, 1.0, -1.0])
     for turned in (-np.ones(6), signs):
         runs = tuple(replace(run, current_a=run.current_a * turned) for run in noisy_runs[:2])
-        assert identify(truth.model, runs, CONDITIONING).estimate.gains == pytest.approx(
-            GAINS * turned, rel=0.05
-        )
+        gains = identify(truth.model, runs, CONDITIONING).estimate.gains
+        assert gains == pytest.approx(GAINS * turned, rel=0.05)
 
 
 def test_fixed_gains_of_the_wrong_sign_are_refused(
@@ -105,9 +107,8 @@ def test_a_robot_without_dry_friction_is_not_refused(truth: Truth) -> None:
         )
         for i in (0, 1)
     )
-    assert identify(truth.model, runs, CONDITIONING).estimate.gains == pytest.approx(
-        GAINS, rel=0.05
-    )
+    gains = identify(truth.model, runs, CONDITIONING).estimate.gains
+    assert gains == pytest.approx(GAINS, rel=0.05)
     known = identify(truth.model, runs[:1], CONDITIONING, method=Method.WLS, fixed_gains=GAINS)
     friction = [
         v
@@ -125,11 +126,15 @@ def test_gains_beside_which_the_payload_weighs_nothing_have_no_scale(
     require_seen_payload(found.estimate, found.system)
     one = found.estimate
     scale = np.concatenate((np.full(6, 1e8), np.full(len(one.parameters), 1e8)))
+    scale_outer = np.outer(scale, scale)
+    covariance = one.covariance * scale_outer
+    gains = 1e8 * one.gains
+    parameters = 1e8 * one.parameters
     away = replace(
         one,
-        gains=1e8 * one.gains,
-        parameters=1e8 * one.parameters,
-        covariance=one.covariance * np.outer(scale, scale),
+        gains=gains,
+        parameters=parameters,
+        covariance=covariance,
     )
     with pytest.raises(PayloadUnseen, match="not in rad, or columns in another order"):
         require_seen_payload(away, found.system)
@@ -157,15 +162,20 @@ def test_exchanged_channels_are_refused(
 @given(total=st.floats(0.0, 200.0), axis=st.floats(0.0, 1000.0), unknown=st.booleans())
 def test_what_is_refused_is_what_the_limits_say(total: float, axis: float, unknown: bool) -> None:
     error = RelativeError((axis, 1.0), total)
+    covariance = np.diag([4.41 if unknown else 3.61, 1.0])
+    gains = np.array([2.0, -3.0])
+    parameters = np.zeros(0)
+    axis_noise = np.ones(2)
+    singular_values = np.ones(2)
     estimate = Estimate(
         method=Method.ML,
-        gains=np.array([2.0, -3.0]),
+        gains=gains,
         gains_fixed=False,
         unknowns=(),
-        parameters=np.zeros(0),
-        covariance=np.diag([4.41 if unknown else 3.61, 1.0]),
-        axis_noise=np.ones(2),
-        singular_values=np.ones(2),
+        parameters=parameters,
+        covariance=covariance,
+        axis_noise=axis_noise,
+        singular_values=singular_values,
         condition=1.0,
         rows=9,
     )
@@ -174,8 +184,10 @@ def test_what_is_refused_is_what_the_limits_say(total: float, axis: float, unkno
             require_plausible(estimate, error, ("J1", "J2"))
     else:
         require_plausible(estimate, error, ("J1", "J2"))
+    axes = (float("nan"), 1.0)
+    relative_error = RelativeError(axes, float("nan"))
     with pytest.raises(ModelContradicted):  # what is no number is within no limit
-        require_plausible(estimate, RelativeError((float("nan"), 1.0), float("nan")), ("J1", "J2"))
+        require_plausible(estimate, relative_error, ("J1", "J2"))
 
 
 def test_few_but_honest_data_pass(truth: Truth) -> None:
@@ -186,4 +198,5 @@ def test_few_but_honest_data_pass(truth: Truth) -> None:
         for i in range(2)
     ]
     found = identify(truth.model, runs, CONDITIONING, method=Method.ML)
-    assert np.max(found.estimate.gains_std / np.abs(found.estimate.gains)) < 0.1
+    absolute_gain = np.abs(found.estimate.gains)
+    assert np.max(found.estimate.gains_std / absolute_gain) < 0.1

@@ -26,12 +26,14 @@ def truth() -> Truth:
     """The arm of three axes, whose second link carries the payload."""
     last = three_axes_truth()
     robot = robot_from_urdf(THREE_AXES.urdf, platform="link1")
-    return replace(last, model=Model(robot, last.model.drive_train))
+    model = Model(robot, last.model.drive_train)
+    return replace(last, model=model)
 
 
 def test_gains_and_payload_come_back(truth: Truth) -> None:
     rng = np.random.default_rng(5)
-    drawn = replace(MOUNTED, known={name: PAYLOAD_TRUTH[name] for name in ("mx", "my", "mz", "m")})
+    known = {name: PAYLOAD_TRUTH[name] for name in ("mx", "my", "mz", "m")}
+    drawn = replace(MOUNTED, known=known)
     runs = (
         record(truth, "bare", rng, noise_a=0.01),
         record(truth, "loaded", rng, drawn, noise_a=0.01),

@@ -65,9 +65,9 @@ def _refitted(
     above = _fitted(truth, runs, known, 1.0 + STEP, method).estimate
     below = _fitted(truth, runs, known, 1.0 - STEP, method).estimate
     between_kg = 2.0 * STEP * known["m"]
-    return (above.gains - below.gains) / between_kg, (
-        above.parameters - below.parameters
-    ) / between_kg
+    gain_difference = above.gains - below.gains
+    parameter_difference = above.parameters - below.parameters
+    return gain_difference / between_kg, (parameter_difference) / between_kg
 
 
 @pytest.mark.parametrize(("method", "tolerance", "known"), CASES)
@@ -85,7 +85,9 @@ def test_the_derivative_is_that_of_refits_with_another_mass(
     std = found.estimate.parameters_std
     refitted = parameters_per_kg / std
     difference = response.parameters_per_kg / std - refitted
-    assert np.abs(difference).max() < 0.03 * np.abs(refitted).max()
+    largest_absolute_difference = np.abs(difference).max()
+    largest_absolute_refitted = np.abs(refitted).max()
+    assert largest_absolute_difference < 0.03 * largest_absolute_refitted
     assert relative == pytest.approx(expected, abs=tolerance)
     if known == "mass":
         assert relative == pytest.approx(np.ones(6), abs=0.001)
@@ -123,17 +125,20 @@ def test_two_bodies_have_a_derivative_each_and_two_mountings_of_one_body_one(
     mass = PAYLOAD_TRUTH["m"]
     turned = replace(MOUNTED, mounting="b")
     (one,) = mass_responses(*_parts(with_payloads(MOUNTED, turned)))
-    two = mass_responses(*_parts(with_payloads(MOUNTED, replace(turned, name="plate"))))
-    assert [response.payload for response in two] == ["disc", "plate"]
+    changed_turned = replace(turned, name="plate")
+    two = mass_responses(*_parts(with_payloads(MOUNTED, changed_turned)))
+    payloads = [response.payload for response in two]
+    assert payloads == ["disc", "plate"]
     assert sum(response.gain_per_kg for response in two) == pytest.approx(one.gain_per_kg, rel=1e-6)
-    heavier = with_payloads(
-        replace(MOUNTED, known={"m": mass * (1.0 + STEP)}), replace(turned, name="plate")
-    )
+    changed_mounted = replace(MOUNTED, known={"m": mass * (1.0 + STEP)})
+    heavier = with_payloads(changed_mounted, replace(turned, name="plate"))
     lighter = with_payloads(
         replace(MOUNTED, known={"m": mass * (1.0 - STEP)}), replace(turned, name="plate")
     )
-    expected = (heavier.estimate.gains - lighter.estimate.gains) / (2.0 * STEP * mass)
-    assert two[0].gain_per_kg / heavier.estimate.gains == pytest.approx(
+    gain_difference = heavier.estimate.gains - lighter.estimate.gains
+    expected = gain_difference / (2.0 * STEP * mass)
+    gain_per_kg = two[0].gain_per_kg
+    assert gain_per_kg / heavier.estimate.gains == pytest.approx(
         expected / heavier.estimate.gains, abs=0.003
     )
 

@@ -22,7 +22,8 @@ PLATE = Payload("plate", "b", {"m": DECLARED_KG})
 def recordings(plate_kg: float, *, count: int = 4) -> list[Run]:
     """Runs without load and with the disc in turn, and two with a plate that is declared 2 kg."""
     plate = BODY * (plate_kg / BODY[-1])
-    runs = small_recordings(TRUTH, 0, count=count + 4, bodies={count + 1: plate, count + 3: plate})
+    bodies = {count + 1: plate, count + 3: plate}
+    runs = small_recordings(TRUTH, 0, count=count + 4, bodies=bodies)
     of_plate = [replace(runs[index], payload=PLATE) for index in (count + 1, count + 3)]
     return [*runs[:count], *of_plate]
 
@@ -42,7 +43,8 @@ def test_masses_that_agree_are_not_named() -> None:
 
 @pytest.mark.parametrize(("times", "first"), [(1.3, "plate"), (0.75, "disc")])
 def test_masses_that_contradict_each_other_are_named_together(times: float, first: str) -> None:
-    (found,) = of_payloads(recordings(times * DECLARED_KG))
+    runs = recordings(times * DECLARED_KG)
+    (found,) = of_payloads(runs)
     assert (found.name, found.runs) == ("masses-contradict", ())
     other = "disc" if first == "plate" else "plate"
     ratio = times if first == "plate" else 1.0 / times
@@ -52,25 +54,27 @@ def test_masses_that_contradict_each_other_are_named_together(times: float, firs
 
 
 def test_masses_that_leave_no_scale_are_refused_by_the_same_name() -> None:
+    plate_kg = 3.0 * DECLARED_KG
     with pytest.raises(
         MassesContradict,
         match=r"by the torques plate is 2\.9\d ± .* times as "
         r"heavy beside disc",
     ):
-        diagnosed(TRUTH, recordings(3.0 * DECLARED_KG))
+        diagnosed(TRUTH, recordings(plate_kg))
 
 
 def test_another_body_in_one_run_is_no_contradiction_of_masses() -> None:
     """Two runs carry the disc, and the moves of one of them deny it."""
-    runs = small_recordings(
-        TRUTH, 0, count=8, bodies={3: 0.7 * BODY, 7: BODY * (DECLARED_KG / BODY[-1])}
-    )
-    used = [*runs[:7], replace(runs[7], payload=PLATE)]
+    bodies = {3: 0.7 * BODY, 7: BODY * (DECLARED_KG / BODY[-1])}
+    runs = small_recordings(TRUTH, 0, count=8, bodies=bodies)
+    changed_run = replace(runs[7], payload=PLATE)
+    used = [*runs[:7], changed_run]
     (found,) = of_payloads(used)
     assert (found.name, found.runs) == ("payload-differs", ("r3",))
 
 
 def test_a_run_without_load_is_not_blamed_for_another_body_in_a_loaded_run() -> None:
-    runs = small_recordings(TRUTH, 1, count=6, bodies={3: 0.7 * BODY})
+    bodies = {3: 0.7 * BODY}
+    runs = small_recordings(TRUTH, 1, count=6, bodies=bodies)
     (found,) = of_payloads(runs)
     assert found.runs == ("r3",)

@@ -51,7 +51,8 @@ def test_recordings_without_noise_give_gains_and_parameters_back(
 
 def test_a_closed_chain_with_a_motor_for_each_freedom_is_one_of_these_robots() -> None:
     made = recorded(FIVE_BAR)
-    gains, _ = mixed_tls(regrouped(reduce_runs(made.model, made.runs, made.conditioning)))
+    system = regrouped(reduce_runs(made.model, made.runs, made.conditioning))
+    gains, _ = mixed_tls(system)
     assert gains == pytest.approx(FIVE_BAR.gains, rel=1e-6)
 
 
@@ -60,7 +61,8 @@ def test_it_is_maximum_likelihood_to_a_fiftieth_of_its_error_bar(standard: Syste
     likeliest = ml(regrouped(standard))
     assert found.gains is not None
     assert found.gains_std is not None
-    assert np.max(np.abs(found.gains - likeliest.gains) / likeliest.gains_std) < 0.02
+    gain_difference = np.abs(found.gains - likeliest.gains)
+    assert np.max(gain_difference / likeliest.gains_std) < 0.02
     assert found.gains_std == pytest.approx(likeliest.gains_std, rel=0.05)
     assert found.std_percent == pytest.approx(100.0 * found.gains_std / np.abs(GAINS), rel=0.2)
 
@@ -69,7 +71,8 @@ def test_weighted_least_squares_makes_gains_too_small_where_it_does_not(standard
     found = quick_gains(standard)
     assert found.gains is not None
     assert np.max(np.abs(found.gains / GAINS - 1.0)) < 0.04
-    assert np.max(wls(regrouped(standard)).gains / GAINS) < 0.95
+    gains = wls(regrouped(standard)).gains
+    assert np.max(gains / GAINS) < 0.95
 
 
 @pytest.fixture(scope="module")
@@ -102,8 +105,11 @@ def test_gains_are_in_the_units_of_currents_and_payload(
     for run in small_pieces:
         payload = run.payload
         if payload is not None:
-            payload = Payload(payload.name, payload.mounting, {"m": heavier * payload.known["m"]})
-        changed.append(replace(run, current_a=run.current_a * unit, payload=payload))
+            known = {"m": heavier * payload.known["m"]}
+            payload = Payload(payload.name, payload.mounting, known)
+        current_a = run.current_a * unit
+        changed_run = replace(run, current_a=current_a, payload=payload)
+        changed.append(changed_run)
     after = quick_gains(reduce_runs(small_truth.model, changed, SMALL))
     assert before.gains is not None
     assert before.gains_std is not None

@@ -48,7 +48,8 @@ def _record(
         parameters[truth.model.flange] += [
             body[name] - PAYLOAD_TRUTH[name] for name in LINK_PARAMETERS
         ]
-    return record(replace(truth, parameters=parameters), name, rng, payload, noise_a=0.1)
+    changed_truth = replace(truth, parameters=parameters)
+    return record(changed_truth, name, rng, payload, noise_a=0.1)
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +82,8 @@ def test_each_mounting_has_its_own_unknowns(identified: Identification) -> None:
     found = identified.estimate
     assert found.gains == pytest.approx(GAINS, rel=0.01)
     values = dict(zip((column.name for column in found.unknowns), found.parameters, strict=True))
-    assert len(values) == 61 + 9 + 9 + 10
+    expected = 61 + 9 + 9 + 10
+    assert len(values) == expected
     for mounting, body in (("a", PAYLOAD_TRUTH), ("b", OTHER_MOUNTING), ("c", PLATE)):
         for name in ("mx", "my", "mz"):
             assert values[f"{name}:{mounting}"] == pytest.approx(body[name], abs=0.01)
@@ -111,11 +113,14 @@ def test_more_knowledge_is_used(
 
     (5) from one to ten: what is known is not estimated, and all of it is consistent.
     """
-    payload = Payload("disc", "a", {name: PAYLOAD_TRUTH[name] for name in names})
-    runs = (clean_runs[0], replace(clean_runs[1], payload=payload))
+    known = {name: PAYLOAD_TRUTH[name] for name in names}
+    payload = Payload("disc", "a", known)
+    changed_clean_run = replace(clean_runs[1], payload=payload)
+    runs = (clean_runs[0], changed_clean_run)
     system = identify(truth.model, runs, CONDITIONING).system
     for method in (Method.WLS, Method.TLS, Method.ML):
         found = estimate_with(method, system)
         assert found.gains == pytest.approx(GAINS, rel=2e-4)
         unknown = {column.name for column in found.unknowns if ":" in column.name}
-        assert unknown == {f"{name}:a" for name in LINK_PARAMETERS if name not in names}
+        expected = {f"{name}:a" for name in LINK_PARAMETERS if name not in names}
+        assert unknown == expected

@@ -40,15 +40,25 @@ TWO_AXES = Model(
 def _system(matrix: FloatArray) -> System:
     """W_tot of two joints, the first half of the rows the first one's."""
     halves = np.split(matrix, 2)
+    factors = tuple(triangle((half,), 7) for half in halves)
+    rows = np.array([ROWS // 2] * 2)
+    joints = Triangles(factors, rows)
+    independent = (0, 1, 2)
+    grouping = np.eye(3)
+    names = ("a", "b", "c")
+    base = BaseParameters(independent, grouping, names)
+    columns = tuple(Column(name, "1") for name in "abc")
+    motors = Triangles((), np.zeros(0, dtype=np.int64))
+    payloads = (Payload("disc", "x", {"m": 1.0}),)
     return System(
         model=TWO_AXES,
-        base=BaseParameters((0, 1, 2), np.eye(3), ("a", "b", "c")),
-        columns=tuple(Column(name, "1") for name in "abc"),
-        payloads=(Payload("disc", "x", {"m": 1.0}),),
+        base=base,
+        columns=columns,
+        payloads=payloads,
         payload_columns=((0,),),
         runs=("run",),
-        joints=Triangles(tuple(triangle((half,), 7) for half in halves), np.array([ROWS // 2] * 2)),
-        motors=Triangles((), np.zeros(0, dtype=np.int64)),
+        joints=joints,
+        motors=motors,
         clusters=(),
     )
 
@@ -68,14 +78,17 @@ def _scatter(
     rng = np.random.default_rng(4)
     exact = _exact(rng)
     found = [estimate(_system(disturb(exact, rng))) for _ in range(400)]
-    values = np.stack([np.concatenate((e.gains, e.parameters)) for e in found])
+    stacked_gains = [np.concatenate((e.gains, e.parameters)) for e in found]
+    values = np.stack(stacked_gains)
     return values.mean(axis=0), np.cov(values.T), np.mean([e.covariance for e in found], axis=0)
 
 
 def _agree(measured: FloatArray, claimed: FloatArray) -> None:
     assert np.diag(claimed) == pytest.approx(np.diag(measured), rel=0.3)
-    scale = np.sqrt(np.outer(np.diag(measured), np.diag(measured)))
-    assert np.max(np.abs(claimed - measured) / scale) < 0.3
+    measured_diagonal_outer = np.outer(np.diag(measured), np.diag(measured))
+    scale = np.sqrt(measured_diagonal_outer)
+    claimed_difference = np.abs(claimed - measured)
+    assert np.max(claimed_difference / scale) < 0.3
 
 
 def test_least_squares_scatters_as_equation_10_says() -> None:
@@ -119,7 +132,8 @@ def test_total_least_squares_scatters_as_equation_23_says(scaling: Scaling) -> N
 
     mean, measured, claimed = _scatter(lambda system: tls(system, scaling), disturb)
     _agree(measured, claimed)
-    bias = np.abs(mean - SOLUTION[:-1])
+    mean_difference = mean - SOLUTION[:-1]
+    bias = np.abs(mean_difference)
     assert np.all(bias < 4.0 * np.sqrt(np.diag(measured) / 400) + 1e-3)
 
     def much(exact: FloatArray, rng: np.random.Generator) -> FloatArray:
@@ -151,22 +165,25 @@ def test_the_triangles_give_the_formulas_of_all_rows(noisy: Evidence) -> None:
     count, unknowns = regressor.shape
     solution = np.linalg.lstsq(regressor, right, rcond=None)[0]
     variance = np.sum((right - regressor @ solution) ** 2) / (count - unknowns)
-    covariance = variance * np.linalg.inv(regressor.T @ regressor)
+    inverse = np.linalg.inv(regressor.T @ regressor)
+    covariance = variance * inverse
     found = ls(rows.system())
-    assert np.concatenate((found.gains, found.parameters)) == pytest.approx(
-        solution, rel=1e-6, abs=1e-8
-    )
-    assert np.sqrt(np.diag(found.covariance)) == pytest.approx(
-        np.sqrt(np.diag(covariance)), rel=1e-5
-    )
+    stacked_gains = np.concatenate((found.gains, found.parameters))
+    assert stacked_gains == pytest.approx(solution, rel=1e-6, abs=1e-8)
+    covariance_diagonal_root = np.sqrt(np.diag(found.covariance))
+    assert covariance_diagonal_root == pytest.approx(np.sqrt(np.diag(covariance)), rel=1e-5)
     _, s, vt = np.linalg.svd(matrix, full_matrices=False)
     vector = vt[-1] / vt[-1, -1]
-    compatible = (matrix - np.outer(matrix @ vt[-1], vt[-1]))[:, :-1]
-    noise = s[-1] ** 2 / (count - matrix.shape[1])
+    matrix_difference = matrix - np.outer(matrix @ vt[-1], vt[-1])
+    compatible = matrix_difference[:, :-1]
+    count_difference = count - matrix.shape[1]
+    noise = s[-1] ** 2 / count_difference
     size = 1.0 + np.sum(vector[:-1] ** 2)
     total = tls(rows.system(), Scaling.NONE)
     assert np.concatenate((total.gains, total.parameters)) == pytest.approx(
         vector[:-1], rel=1e-5, abs=1e-7
     )
-    claimed = np.sqrt(np.diag(noise * size * np.linalg.inv(compatible.T @ compatible)))
-    assert np.sqrt(np.diag(total.covariance)) == pytest.approx(claimed, rel=1e-4)
+    diagonal = np.diag(noise * size * np.linalg.inv(compatible.T @ compatible))
+    claimed = np.sqrt(diagonal)
+    covariance_diagonal = np.diag(total.covariance)
+    assert np.sqrt(covariance_diagonal) == pytest.approx(claimed, rel=1e-4)

@@ -55,7 +55,8 @@ def with_positions(runs: list[Run], signs: FloatArray) -> list[Run]:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_nothing_is_found_in_clean_recordings(truth: Truth, seed: int) -> None:
-    assert found_in(truth, small_recordings(truth, seed, noise_a=0.15)) is None
+    runs = small_recordings(truth, seed, noise_a=0.15)
+    assert found_in(truth, runs) is None
 
 
 @pytest.mark.parametrize(
@@ -64,21 +65,27 @@ def test_nothing_is_found_in_clean_recordings(truth: Truth, seed: int) -> None:
 def test_gravity_is_found_within_a_degree(
     truth: Truth, clean: list[Run], declared: tuple[int, ...]
 ) -> None:
-    gravity = 9.81 * np.array(declared) / np.linalg.norm(declared)
-    found = found_in(replace(truth, model=with_gravity(truth.model, gravity)), clean)
+    declared_norm = np.linalg.norm(declared)
+    gravity = 9.81 * np.array(declared) / declared_norm
+    model = with_gravity(truth.model, gravity)
+    changed_truth = replace(truth, model=model)
+    found = found_in(changed_truth, clean)
     assert found is not None
     assert found.gravity is not None
     assert found.diagnosis(AXES).name == GRAVITY_TURNED
     cosine = found.gravity.found_m_s2 @ DOWN / 9.81**2
     assert np.rad2deg(np.arccos(min(cosine, 1.0))) < max(1.0, 4.0 * found.gravity.std_deg)
     assert found.gravity.std_deg < 2.0
-    assert np.linalg.norm(found.gravity.found_m_s2) == pytest.approx(9.81)
+    gravity_size_m_s2 = np.linalg.norm(found.gravity.found_m_s2)
+    assert gravity_size_m_s2 == pytest.approx(9.81)
 
 
 def test_a_small_turn_of_gravity_is_no_gross_mistake(truth: Truth, clean: list[Run]) -> None:
     angle = np.deg2rad(0.5 * SMALLEST_TURN_DEG)
-    tilted = with_gravity(truth.model, 9.81 * np.array([np.sin(angle), 0.0, -np.cos(angle)]))
-    assert found_in(replace(truth, model=tilted), clean) is None
+    gravity_m_s2 = 9.81 * np.array([np.sin(angle), 0.0, -np.cos(angle)])
+    tilted = with_gravity(truth.model, gravity_m_s2)
+    changed_truth = replace(truth, model=tilted)
+    assert found_in(changed_truth, clean) is None
 
 
 @pytest.mark.parametrize("current_sign", [1.0, -1.0])
@@ -90,16 +97,19 @@ def test_a_reversed_position_is_found(
     signs[axis] = -1.0
     currents = np.ones(3)
     currents[axis] = current_sign
-    found = found_in(truth, with_currents(with_positions(clean, signs), currents))
+    runs = with_currents(with_positions(clean, signs), currents)
+    found = found_in(truth, runs)
     assert found is not None
     said = found.diagnosis(AXES)
-    assert (said.name, said.axes) == (POSITION_REVERSED, (AXES[axis],))
+    expected = (POSITION_REVERSED, (AXES[axis],))
+    assert (said.name, said.axes) == expected
     assert found.reversed_currents == ((axis,) if current_sign < 0.0 else ())
     # A current that counts the other way, too, asks for the axis in the URDF, or both signs in the
     # cell file.
     assert ("the <axis> of the joint" in said.remedy) == (current_sign < 0.0)
     assert "`drive_train.ratio`" in said.remedy
-    assert found.corrected_positions(np.ones((1, 3))).tolist() == [signs.tolist()]
+    position_rad = np.ones((1, 3))
+    assert found.corrected_positions(position_rad).tolist() == [signs.tolist()]
 
 
 @pytest.mark.parametrize("offset_deg", [40.0, -45.0, 60.0, 90.0, -90.0, 135.0, 160.0, 180.0])
@@ -108,7 +118,8 @@ def test_a_zero_that_is_far_off_is_found_with_its_size(
 ) -> None:
     """It was silent below 45°, and called a payload that was not there above."""
     offset = np.array([0.0, np.deg2rad(offset_deg), 0.0])
-    found = found_in(truth, [replace(run, position_rad=run.position_rad + offset) for run in clean])
+    runs = [replace(run, position_rad=run.position_rad + offset) for run in clean]
+    found = found_in(truth, runs)
     assert found is not None
     said = found.diagnosis(AXES)
     assert (said.name, said.axes) == (ZERO_TURNED, ("J2",))
@@ -116,7 +127,8 @@ def test_a_zero_that_is_far_off_is_found_with_its_size(
     assert abs((read + offset_deg + 180.0) % 360.0 - 180.0) < 2.0
     assert -180.0 < read <= 180.0
     assert f"add about {read:+.0f} deg to `zero_offset_deg` of J2" in said.remedy
-    corrected = found.corrected_positions(np.zeros((1, 3)))
+    position_rad = np.zeros((1, 3))
+    corrected = found.corrected_positions(position_rad)
     assert corrected == pytest.approx(np.deg2rad([[0.0, read, 0.0]]))
 
 
@@ -126,8 +138,10 @@ def test_find_turned_geometry_with_a_leaning_base_blames_no_zero(truth: Truth) -
     """
     easy = truth.parameters.copy()
     easy[10:14] *= 0.05  # friction of J1 would hide the torque of the lean
-    runs = runs_with_less_of_j1(replace(truth, parameters=easy), share=0.6, noise_a=0.03)
-    leaning = with_gravity(truth.model, tilted_gravity(8.0, azimuth_deg=60.0))
+    changed_truth = replace(truth, parameters=easy)
+    runs = runs_with_less_of_j1(changed_truth, share=0.6, noise_a=0.03)
+    gravity_m_s2 = tilted_gravity(8.0, azimuth_deg=60.0)
+    leaning = with_gravity(truth.model, gravity_m_s2)
     assert found_in(replace(truth, model=leaning), runs) is None
 
 
@@ -135,8 +149,10 @@ def test_find_turned_geometry_where_j1_hardly_moves_names_gravity_and_the_zero_t
     truth: Truth,
 ) -> None:
     runs = runs_with_less_of_j1(truth, share=0.1, noise_a=0.1)
-    leaning = with_gravity(truth.model, tilted_gravity(14.0, azimuth_deg=180.0))
-    found = found_in(replace(truth, model=leaning), runs)
+    gravity_m_s2 = tilted_gravity(14.0, azimuth_deg=180.0)
+    leaning = with_gravity(truth.model, gravity_m_s2)
+    changed_truth = replace(truth, model=leaning)
+    found = found_in(changed_truth, runs)
     assert found is not None
     assert found.gravity is not None
     assert [reading.axis for reading in found.readings] == [1]
@@ -183,10 +199,8 @@ def test_a_zero_that_no_torque_shows_is_not_found(
     """About a vertical axis and behind the last joint another zero makes the same torques."""
     offset = np.zeros(3)
     offset[axis] = np.deg2rad(90.0)
-    assert (
-        found_in(truth, [replace(run, position_rad=run.position_rad + offset) for run in clean])
-        is None
-    )
+    runs = [replace(run, position_rad=run.position_rad + offset) for run in clean]
+    assert found_in(truth, runs) is None
 
 
 @pytest.mark.parametrize(
@@ -203,14 +217,18 @@ def test_a_zero_that_no_torque_shows_is_not_found(
 def test_mistakes_of_currents_are_no_geometry(
     truth: Truth, clean: list[Run], factor: FloatArray, order: tuple[int, ...]
 ) -> None:
-    assert found_in(truth, with_currents(clean, factor, order)) is None
+    runs = with_currents(clean, factor, order)
+    assert found_in(truth, runs) is None
 
 
 def test_a_reversed_current_beside_a_wrong_gravity_does_not_hide_it(
     truth: Truth, clean: list[Run]
 ) -> None:
-    wall = replace(truth, model=with_gravity(truth.model, np.array([9.81, 0.0, 0.0])))
-    found = found_in(wall, with_currents(clean, np.array([1.0, -1.0, 1.0])))
+    gravity_m_s2 = np.array([9.81, 0.0, 0.0])
+    model = with_gravity(truth.model, gravity_m_s2)
+    wall = replace(truth, model=model)
+    runs = with_currents(clean, np.array([1.0, -1.0, 1.0]))
+    found = found_in(wall, runs)
     assert found is not None
     assert found.gravity is not None
     assert found.reversed_currents == (1,)
@@ -218,7 +236,9 @@ def test_a_reversed_current_beside_a_wrong_gravity_does_not_hide_it(
 
 @pytest.mark.parametrize("gains_fixed", [False, True])
 def test_a_fit_of_all_rows_confirms_it(truth: Truth, clean: list[Run], gains_fixed: bool) -> None:
-    wall = replace(truth, model=with_gravity(truth.model, np.array([0.0, 9.81, 0.0])))
+    gravity_m_s2 = np.array([0.0, 9.81, 0.0])
+    model = with_gravity(truth.model, gravity_m_s2)
+    wall = replace(truth, model=model)
     found = found_in(wall, clean)
     assert found is not None
 
@@ -243,15 +263,18 @@ def test_products_serve_every_direction(truth: Truth, clean: list[Run]) -> None:
     gravity = np.array([3.0, -4.0, 5.0])
     weighed = gravity_products(truth.model, instants)
     square = weighed.directed(gravity).square.sum(axis=1)
-    own = gravity_products(with_gravity(truth.model, gravity), instants)
+    model = with_gravity(truth.model, gravity)
+    own = gravity_products(model, instants)
     assert np.array_equal(own.square, weighed.square)  # the declared gravity takes no part
-    columns = with_gravity(truth.model, gravity).regressor(instants[0].motion)[1]
+    motion = instants[0].motion
+    columns = with_gravity(truth.model, gravity).regressor(motion)[1]
     first = square_of(columns, instants[0], 1)
     bare = gravity_products(truth.model, instants[:1]).directed(gravity).square.sum(axis=1)[1]
-    np.testing.assert_allclose(
-        bare[:-1, :-1], first * truth.model.drive_train.to_motor[1, 1] ** 2, atol=1e-9
-    )
-    assert square.shape[-1] == len(truth.model.columns) + 10 + 1
+    to_motor = truth.model.drive_train.to_motor
+    expected = first * to_motor[1, 1] ** 2
+    np.testing.assert_allclose(bare[:-1, :-1], expected, atol=1e-9)
+    column_count_expected = len(truth.model.columns) + 10 + 1
+    assert square.shape[-1] == column_count_expected
 
 
 def square_of(columns: FloatArray, instants: Instants, motor: int) -> FloatArray:
@@ -261,4 +284,5 @@ def square_of(columns: FloatArray, instants: Instants, motor: int) -> FloatArray
 
 
 def test_without_rows_nothing_is_found(truth: Truth) -> None:
-    assert find_turned_geometry(truth.model, (), truth.gains) is None
+    turned_geometry = find_turned_geometry(truth.model, (), truth.gains)
+    assert turned_geometry is None

@@ -38,7 +38,7 @@ STEP_S = 1e-3
 
 def test_parameters_are_the_zeros_of_motors_and_the_lengths_of_moving_links() -> None:
     names = [one.name for one in geometry_parameters(FIVE_BAR.robot)]
-    assert names == [
+    expected = [
         "zero of left-crank",
         "zero of right-crank",
         "length from left-crank to left-rod",
@@ -46,6 +46,7 @@ def test_parameters_are_the_zeros_of_motors_and_the_lengths_of_moving_links() ->
         "length from left-rod to tip",
         "length from right-rod to tip",
     ]
+    assert names == expected
 
 
 @pytest.mark.parametrize("mechanism", [FIVE_BAR, THREE_LEGS], ids=lambda one: one.name)
@@ -92,12 +93,13 @@ def test_an_unknown_length_is_refused_with_those_that_there_are() -> None:
 
 def _model(spec: CellSpec) -> Model:
     pairs = [LinkPair(one.name, one.first, one.second, one.directions) for one in spec.closures]
+    assembly_rad = dict(spec.assembly_rad)
     robot = robot_from_urdf(
         spec.urdf,
         spec.gravity_m_s2,
         closures=pairs,
         motors=spec.motors,
-        assembly_rad=dict(spec.assembly_rad),
+        assembly_rad=assembly_rad,
         platform=spec.platform,
     )
     return Model(robot, DriveTrain(spec.ratio))
@@ -107,7 +109,8 @@ def _standard(model: Model, spec: CellSpec) -> FloatArray:
     """Parameters of the links as Pinocchio reads them:
     m, m c and the inertia about the joint's origin.
     """
-    tree = link_model(replace(spec, payload=None))
+    changed_spec = replace(spec, payload=None)
+    tree = link_model(changed_spec)
     standard = np.zeros(len(model.columns))
     for joint, columns in zip(model.robot.joints, model.link_columns, strict=True):
         m, mx, my, mz, xx, xy, yy, xz, yz, zz = tree.inertias[
@@ -118,14 +121,18 @@ def _standard(model: Model, spec: CellSpec) -> FloatArray:
 
 
 def _axes_motion(model: Model, samples: int) -> Motion:
-    t = np.linspace(0.0, 1.0, samples)[:, None]
-    home = model.assembly.position_rad[list(model.robot.axis_joints)]
+    grid = np.linspace(0.0, 1.0, samples)
+    t = grid[:, None]
+    axis_joints = list(model.robot.axis_joints)
+    home = model.assembly.position_rad[axis_joints]
     wave = 2.0 * np.pi * np.array([0.7, 1.1])
     position = home + 0.25 * np.sin(wave * t + [0.0, 1.0])
+    acceleration_rad_s2 = -0.25 * wave**2 * np.sin(wave * t + [0.0, 1.0])
+    velocity_rad_s = 0.25 * wave * np.cos(wave * t + [0.0, 1.0])
     return Motion(
         position,
-        0.25 * wave * np.cos(wave * t + [0.0, 1.0]),
-        -0.25 * wave**2 * np.sin(wave * t + [0.0, 1.0]),
+        velocity_rad_s,
+        acceleration_rad_s2,
     )
 
 
@@ -133,7 +140,8 @@ def _simulated_torque(spec: CellSpec, motion: Motion, zero_rad: FloatArray) -> F
     """Torque of the motors, shape (m, k): the simulator's closures, differences in time,
     and Pinocchio's RNEA.
     """
-    tree = link_model(replace(spec, payload=None))
+    changed_spec = replace(spec, payload=None)
+    tree = link_model(changed_spec)
     mechanism = SimulatedMechanism(tree, spec)
     data = tree.createData()
     motors = len(spec.motors)
@@ -180,28 +188,33 @@ def test_the_derivative_of_the_torques_is_that_of_the_simulated_five_bar() -> No
     described = f'xyz="{length_m:g} 0 0"'
     before, _, after = spec.urdf.partition(f'name="{crank.name}"')
     assert described in after
+    changed_after = after.replace(described, f'xyz="{length_m + step!r} 0 0"', 1)
+    changed_after_urdf = f'{before}name="{crank.name}"' + changed_after
     longer = replace(
         spec,
-        urdf=f'{before}name="{crank.name}"'
-        + after.replace(described, f'xyz="{length_m + step!r} 0 0"', 1),
+        urdf=changed_after_urdf,
+    )
+    urdf = f'{before}name="{crank.name}"' + after.replace(
+        described, f'xyz="{length_m - step!r} 0 0"', 1
     )
     shorter = replace(
         spec,
-        urdf=f'{before}name="{crank.name}"'
-        + after.replace(described, f'xyz="{length_m - step!r} 0 0"', 1),
+        urdf=urdf,
     )
     by_length = _simulated_torque(longer, motion, no_zero) - _simulated_torque(
         shorter, motion, no_zero
     )
     turned = np.array([step, 0.0])
     by_zero = _simulated_torque(spec, motion, turned) - _simulated_torque(spec, motion, -turned)
+    geometry_parameter = GeometryParameter(GeometryKind.ZERO, model.robot.axes[0].name)
     for parameter, change in (
         (GeometryParameter(GeometryKind.LENGTH, driven, crank.name), by_length),
-        (GeometryParameter(GeometryKind.ZERO, model.robot.axes[0].name), by_zero),
+        (geometry_parameter, by_zero),
     ):
         expected = change / (2.0 * step)
         found = torque_derivative(model, motion, standard, parameter)
-        assert_allclose(found, expected, atol=2e-3 * np.abs(expected).max())
+        largest_absolute_expected = np.abs(expected).max()
+        assert_allclose(found, expected, atol=2e-3 * largest_absolute_expected)
 
 
 def test_the_torque_beside_a_redundant_robot_is_the_derivative_times_the_change() -> None:
@@ -209,16 +222,18 @@ def test_the_torque_beside_a_redundant_robot_is_the_derivative_times_the_change(
     model = PLANAR.model
     rng = np.random.default_rng(3)
     standard = rng.uniform(0.1, 1.0, len(model.columns))
-    home = model.assembly.position_rad[list(model.robot.axis_joints)]
+    axis_joints = list(model.robot.axis_joints)
+    home = model.assembly.position_rad[axis_joints]
     still = np.zeros((1, 4))
-    motion = Motion(home[None], still, still + 1.0)
+    acceleration_rad_s2 = still + 1.0
+    motion = Motion(home[None], still, acceleration_rad_s2)
     described = model.torques(motion, standard)[2]
     for parameter in geometry_parameters(model.robot)[1::4]:
         slope = torque_derivative(model, motion, standard, parameter)
         left = []
         for change in (2e-3, 1e-3):
             beside = model_with_geometry(model, (GeometryChange(parameter, change),))
-            left.append(
-                np.linalg.norm(beside.torques(motion, standard)[2] - described - change * slope)
-            )
+            difference = beside.torques(motion, standard)[2] - described
+            difference_norm = np.linalg.norm(difference - change * slope)
+            left.append(difference_norm)
         assert 3.5 < left[0] / left[1] < 4.5

@@ -20,7 +20,9 @@ STEP_S = 1e-4
 
 
 def _model(name: str) -> Model:
-    return model_of(load_cell(Path(shipped_configurations()) / "cells" / f"{name}.yaml"))
+    cells_folder = Path(shipped_configurations()) / "cells"
+    path = cells_folder / f"{name}.yaml"
+    return model_of(load_cell(path))
 
 
 def _five_bar_motion(model: Model) -> Motion:
@@ -30,7 +32,10 @@ def _five_bar_motion(model: Model) -> Motion:
     rate = np.array([7.0, 5.0])
     angle = np.outer(time_s, rate) + phase
     assert model.robot.axis_count == 2
-    return Motion(0.3 * np.sin(angle), 0.3 * rate * np.cos(angle), -0.3 * rate**2 * np.sin(angle))
+    acceleration_rad_s2 = -0.3 * rate**2 * np.sin(angle)
+    velocity_rad_s = 0.3 * rate * np.cos(angle)
+    position_rad = 0.3 * np.sin(angle)
+    return Motion(position_rad, velocity_rad_s, acceleration_rad_s2)
 
 
 def test_a_pivot_turns_by_the_angle_between_its_two_rods() -> None:
@@ -38,13 +43,8 @@ def test_a_pivot_turns_by_the_angle_between_its_two_rods() -> None:
     followed = model.follow(_five_bar_motion(model))
     placed = model.at_places(followed)
     names = [joint.name for joint in model.robot.joints]
-    assert [joint.name for joint in model.robot.places] == [
-        "crank-1",
-        "crank-2",
-        "elbow-1",
-        "elbow-2",
-        "pivot tip",
-    ]
+    expected = ["crank-1", "crank-2", "elbow-1", "elbow-2", "pivot tip"]
+    assert [joint.name for joint in model.robot.places] == expected
     sign = np.array([{"1": -1.0, "2": 1.0}[name[-1]] for name in names])
     for ours, of_joints in (
         (placed.velocity_rad_s, followed.joints.velocity_rad_s),
@@ -57,7 +57,8 @@ def test_a_pivot_turns_by_the_angle_between_its_two_rods() -> None:
 
 def test_motion_of_every_pivot_is_the_derivative_of_its_angle() -> None:
     model = _model("five-bar")
-    placed = model.at_places(model.follow(_five_bar_motion(model)))
+    followed = model.follow(_five_bar_motion(model))
+    placed = model.at_places(followed)
     for value, rate in (
         (placed.position_rad, placed.velocity_rad_s),
         (placed.velocity_rad_s, placed.acceleration_rad_s2),
@@ -70,7 +71,8 @@ def test_motors_supply_the_power_that_a_pivot_loses() -> None:
     # Motors of a redundant drive must fit each other: their positions and speeds are those of the
     # followed joints.
     still = np.zeros((1, 4))
-    home = Motion(model.assembly.position_rad[None, list(model.robot.axis_joints)], still, still)
+    axis_joints = list(model.robot.axis_joints)
+    home = Motion(model.assembly.position_rad[None, axis_joints], still, still)
     at_home = model.follow(home)
     speed = at_home.to_motors @ np.array([0.3, -0.4, 0.9])
     followed = model.follow(replace(home, velocity_rad_s=speed))

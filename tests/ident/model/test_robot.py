@@ -32,7 +32,8 @@ TWO_LINKS = (
 
 
 def _assert_read_as_pinocchio_reads(urdf: str) -> None:
-    _assert_same(read_urdf(urdf), pin.buildModelFromXML(urdf), 1e-14)
+    model = pin.buildModelFromXML(urdf)
+    _assert_same(read_urdf(urdf), model, 1e-14)
 
 
 def _assert_same(found: UrdfRobot, model: pin.Model, tolerance: float) -> None:
@@ -42,7 +43,8 @@ def _assert_same(found: UrdfRobot, model: pin.Model, tolerance: float) -> None:
         placement = model.jointPlacements[number]
         inertia = model.inertias[number]
         prismatic = joint.kind is JointKind.PRISMATIC
-        assert joint.parent == model.parents[number] - 1
+        expected = model.parents[number] - 1
+        assert joint.parent == expected
         assert _far(joint.rotation, placement.rotation) < 1e-14
         assert _far(joint.translation_m, placement.translation) < 1e-14
         assert (
@@ -65,7 +67,8 @@ def _screw(model: pin.Model, number: int) -> FloatArray:
 
 
 def _far(found: FloatArray, expected: FloatArray) -> float:
-    return float(np.abs(found - np.asarray(expected)).max())
+    difference = found - np.asarray(expected)
+    return float(np.abs(difference).max())
 
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
@@ -76,7 +79,8 @@ def test_the_shipped_robots_are_read_as_pinocchio_reads_them(path: Path) -> None
 
 @pytest.mark.parametrize("name", ["tx40/tx40_mdh_modified.urdf", "kr300/kr300.urdf"])
 def test_robots_of_others_are_read_as_pinocchio_reads_them(name: str, shared_data: Path) -> None:
-    _assert_read_as_pinocchio_reads((shared_data / name).read_text())
+    urdf = (shared_data / name).read_text()
+    _assert_read_as_pinocchio_reads(urdf)
 
 
 @settings(deadline=None, max_examples=150, derandomize=True)
@@ -100,9 +104,8 @@ def test_held_joints_are_those_that_pinocchio_locks(seed: int, count: int) -> No
         for number in rng.permutation(np.arange(1, model.njoints))[: rng.integers(0, model.nv)]
     ]
     locked = pin.buildReducedModel(model, held, pin.integrate(model, pin.neutral(model), position))
-    found = hold_joints(
-        urdf, {model.names[number]: position[model.joints[number].idx_v] for number in held}
-    )
+    position_rad = {model.names[number]: position[model.joints[number].idx_v] for number in held}
+    found = hold_joints(urdf, position_rad)
     _assert_same(read_urdf(found), locked, 1e-12)
 
 
@@ -127,12 +130,16 @@ FOLLOWING = '<mimic joint="finger" multiplier="-2" offset="0.1"/>'
 @settings(deadline=None, max_examples=25, derandomize=True)
 @given(angle=st.floats(-7.0, 7.0))
 def test_a_held_gripper_is_the_one_whose_joints_are_fixed_by_hand(angle: float) -> None:
-    held = hold_joints(_with_gripper(TURNING, SLIDING + FOLLOWING), {"finger": angle})
+    sliding_thumb = SLIDING + FOLLOWING
+    urdf = _with_gripper(TURNING, sliding_thumb)
+    held = hold_joints(urdf, {"finger": angle})
+    thumb = f'type="fixed"><origin xyz="0.1 0 {0.1 - 2.0 * angle}"/>'
+    finger = f'type="fixed"><origin xyz="0.1 0 0" rpy="0 0 {angle}"/>'
     _assert_same_robot(
         held,
         _with_gripper(
-            f'type="fixed"><origin xyz="0.1 0 0" rpy="0 0 {angle}"/>',
-            f'type="fixed"><origin xyz="0.1 0 {0.1 - 2.0 * angle}"/>',
+            finger,
+            thumb,
         ),
     )
     _assert_same_robot(
@@ -188,8 +195,10 @@ CHAINED = _with_gripper(TURNING, TURNING + '<mimic joint="finger" multiplier="2"
 
 def test_a_follower_of_a_follower_is_where_the_chain_puts_it() -> None:
     held = hold_joints(CHAINED, {"finger": 0.1})
-    by_hand = hold_joints(CHAINED, {"finger": 0.1, "thumb": 0.2, "tip": -0.1})
-    assert [joint.name for joint in read_urdf(held).joints] == ["j"]
+    position_rad = {"finger": 0.1, "thumb": 0.2, "tip": -0.1}
+    by_hand = hold_joints(CHAINED, position_rad)
+    joints = read_urdf(held).joints
+    assert [joint.name for joint in joints] == ["j"]
     _assert_same_robot(held, by_hand)
 
 
@@ -221,19 +230,23 @@ def test_a_follower_of_a_follower_is_where_the_chain_puts_it() -> None:
 def test_a_follower_is_held_only_where_it_is(
     mimic: str, held: dict[str, float], message: str
 ) -> None:
+    finger = TURNING + mimic
     with pytest.raises(ModelError, match=message):
-        hold_joints(_with_gripper(TURNING + mimic, TURNING), held)
+        hold_joints(_with_gripper(finger, TURNING), held)
 
 
 def test_a_follower_is_held_where_its_leader_puts_it() -> None:
-    same = hold_joints(
-        _with_gripper(TURNING + '<mimic joint="thumb"/>', TURNING), {"finger": 0.1, "thumb": 0.1}
-    )
-    assert [joint.name for joint in read_urdf(same).joints] == ["j"]
-    still = _with_gripper(TURNING + '<mimic joint="j" multiplier="0" offset="0.3"/>', TURNING)
-    assert len(read_urdf(hold_joints(still, {"finger": 0.3, "thumb": 0.0})).joints) == 1
+    urdf = _with_gripper(TURNING + '<mimic joint="thumb"/>', TURNING)
+    same = hold_joints(urdf, {"finger": 0.1, "thumb": 0.1})
+    joints = read_urdf(same).joints
+    assert [joint.name for joint in joints] == ["j"]
+    finger = TURNING + '<mimic joint="j" multiplier="0" offset="0.3"/>'
+    still = _with_gripper(finger, TURNING)
+    position_rad = {"finger": 0.3, "thumb": 0.0}
+    assert len(read_urdf(hold_joints(still, position_rad)).joints) == 1
     # Nothing of this URDF moves a follower of a joint that it does not have.
-    of_another = _with_gripper(TURNING + '<mimic joint="elsewhere"/>', TURNING)
+    turning_finger = TURNING + '<mimic joint="elsewhere"/>'
+    of_another = _with_gripper(turning_finger, TURNING)
     assert len(read_urdf(hold_joints(of_another, {"finger": 0.3, "thumb": 0.0})).joints) == 1
 
 
@@ -252,8 +265,9 @@ def test_a_follower_is_held_where_its_leader_puts_it() -> None:
     ids=["of nothing", "of itself"],
 )
 def test_a_joint_that_follows_no_joint_is_refused(mimic: str, message: str) -> None:
+    finger = TURNING + mimic
     with pytest.raises(ModelError, match=message):
-        robot_from_urdf(_with_gripper(TURNING + mimic, TURNING))
+        robot_from_urdf(_with_gripper(finger, TURNING))
 
 
 def test_a_follower_of_a_follower_follows_the_first_joint() -> None:
@@ -264,12 +278,14 @@ def test_a_follower_of_a_follower_follows_the_first_joint() -> None:
         names[one.follower]: (names[one.leader], one.multiplier, round(one.offset, 12))
         for one in robot.couplings
     }
-    assert ratios == {"thumb": ("finger", 2.0, 0.0), "tip": ("finger", -6.0, 0.5)}
+    expected = {"thumb": ("finger", 2.0, 0.0), "tip": ("finger", -6.0, 0.5)}
+    assert ratios == expected
 
 
 def test_a_floating_base_is_held_where_it_is() -> None:
     base = _with_gripper('type="floating"><origin xyz="1 2 3"/>', 'type="planar">')
-    held = hold_joints(base, {"finger": 0.0, "thumb": 0.0})
+    position_rad = {"finger": 0.0, "thumb": 0.0}
+    held = hold_joints(base, position_rad)
     _assert_same_robot(held, _with_gripper('type="fixed"><origin xyz="1 2 3"/>', 'type="fixed">'))
 
 
@@ -340,8 +356,9 @@ def _inertial(rng: np.random.Generator) -> str:
     ],
 )
 def test_no_geometry_that_cannot_be(wrong: tuple[str, str], message: str) -> None:
+    urdf = SEVEN_AXES.urdf.replace(*wrong, 1)
     with pytest.raises(ModelError, match=message):
-        robot_from_urdf(SEVEN_AXES.urdf.replace(*wrong, 1))
+        robot_from_urdf(urdf)
 
 
 @pytest.mark.parametrize(
@@ -395,7 +412,8 @@ def test_what_is_no_urdf_of_an_arm_is_refused(wrong: tuple[str, str], message: s
 def test_xacro_that_is_not_expanded_is_named(space: str) -> None:
     """An expanded file may still declare the namespace."""
     declared = TWO_LINKS.replace('name="r"', f'name="r" xmlns:xacro="{space}"', 1)
-    assert [joint.name for joint in read_urdf(declared).joints] == ["j"]
+    joints = read_urdf(declared).joints
+    assert [joint.name for joint in joints] == ["j"]
     macro = declared.replace("</robot>", '<xacro:arm prefix=""/></robot>')
     with pytest.raises(
         ModelError,
@@ -452,11 +470,13 @@ def test_what_pinocchio_lets_pass_is_let_pass(twin: str) -> None:
 
 def test_a_link_with_two_parents_is_refused() -> None:
     joint = TWO_LINKS[TWO_LINKS.index("<joint") : TWO_LINKS.index("</robot>")]
-    twice = TWO_LINKS.replace("</robot>", joint.replace('name="j"', 'name="k"') + "</robot>")
+    changed_joint = joint.replace('name="j"', 'name="k"')
+    twice = TWO_LINKS.replace("</robot>", changed_joint + "</robot>")
     with pytest.raises(ModelError, match="'b' is the child of two joints; expected a tree"):
         read_urdf(twice)
+    urdf = TWO_LINKS.replace("</robot>", joint + "</robot>")
     with pytest.raises(ModelError, match="two joints of the URDF have the same name"):
-        read_urdf(TWO_LINKS.replace("</robot>", joint + "</robot>"))
+        read_urdf(urdf)
 
 
 def test_the_arms_of_the_tests_can_be() -> None:

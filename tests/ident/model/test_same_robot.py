@@ -31,20 +31,26 @@ def _model(
 def _names(model: Model, moving: list[int], seed: int = 1) -> tuple[str, ...]:
     """Names of the base parameters that a motion of some joints determines; the others stand."""
     count = model.robot.axis_count
-    drawn = np.random.default_rng(seed).uniform(-1.0, 1.0, (3, SAMPLES, count))
+    rng = np.random.default_rng(seed)
+    drawn = rng.uniform(-1.0, 1.0, (3, SAMPLES, count))
     stand = [joint for joint in range(count) if joint not in moving]
     drawn[:, :, stand] = 0.0
-    regressor = model.regressor(Motion(drawn[0], 2.0 * drawn[1], 6.0 * drawn[2]))
+    velocity_rad_s = 2.0 * drawn[1]
+    acceleration_rad_s2 = 6.0 * drawn[2]
+    motion = Motion(drawn[0], velocity_rad_s, acceleration_rad_s2)
+    regressor = model.regressor(motion)
     rows = regressor.transpose(0, 2, 1).reshape(-1, regressor.shape[1])
     triangle = np.asarray(np.linalg.qr(rows, mode="r"))
-    return base_parameters(triangle, tuple(column.name for column in model.columns)).names
+    names = tuple(column.name for column in model.columns)
+    return base_parameters(triangle, names).names
 
 
 @pytest.mark.parametrize("arm", ARMS, ids=[arm.name for arm in ARMS])
 def test_the_base_parameters_of_a_robot_are_its_own(arm: Arm) -> None:
     model = _model(arm)
     every = list(range(model.robot.axis_count))
-    assert foreign_base_parameter(model, _names(model, every)) is None
+    names = _names(model, every)
+    assert foreign_base_parameter(model, names) is None
 
 
 @settings(max_examples=20, deadline=None)
@@ -53,7 +59,8 @@ def test_those_of_a_motion_of_some_joints_are_its_own_too(arm: Arm, data: st.Dat
     model = _model(arm)
     joints = st.integers(0, model.robot.axis_count - 1)
     moving = data.draw(st.lists(joints, min_size=1, unique=True))
-    assert foreign_base_parameter(model, _names(model, moving)) is None
+    names = _names(model, moving)
+    assert foreign_base_parameter(model, names) is None
 
 
 @pytest.mark.parametrize(
@@ -65,8 +72,10 @@ def test_those_of_a_motion_of_some_joints_are_its_own_too(arm: Arm, data: st.Dat
 )
 def test_those_of_a_longer_robot_are_not(of: str, given_as: str) -> None:
     model = _model(TX40)
-    longer = _model(TX40, TX40.urdf.replace(of, given_as))
-    names = _names(model, list(range(6)))
+    urdf = TX40.urdf.replace(of, given_as)
+    longer = _model(TX40, urdf)
+    moving = list(range(6))
+    names = _names(model, moving)
     foreign = foreign_base_parameter(longer, names)
     assert foreign in names
     assert foreign_base_parameter(model, _names(longer, list(range(6)))) is not None
@@ -74,15 +83,20 @@ def test_those_of_a_longer_robot_are_not(of: str, given_as: str) -> None:
 
 def test_a_corrected_length_is_no_other_robot() -> None:
     model = _model(TX40)
-    corrected = _model(TX40, TX40.urdf.replace("0.225 0 0.035", "0.22502 0 0.035"))
-    assert foreign_base_parameter(corrected, _names(model, list(range(6)))) is None
+    urdf = TX40.urdf.replace("0.225 0 0.035", "0.22502 0 0.035")
+    corrected = _model(TX40, urdf)
+    moving = list(range(6))
+    names = _names(model, moving)
+    assert foreign_base_parameter(corrected, names) is None
 
 
 def test_a_parameter_that_moves_nothing_here_is_of_no_other_robot() -> None:
     """A base that leans shows first moments of the first link, which an upright one does not."""
-    leaning = _model(TX40, gravity=(0.5, 0.3, -9.79))
+    gravity = (0.5, 0.3, -9.79)
+    leaning = _model(TX40, gravity=gravity)
     upright = _model(TX40)
-    names = _names(leaning, list(range(6)))
+    moving = list(range(6))
+    names = _names(leaning, moving)
     assert len(names) > len(_names(upright, list(range(6))))
     assert foreign_base_parameter(leaning, names) is None
     assert foreign_base_parameter(upright, names) is None

@@ -25,13 +25,16 @@ def test_digits_of_noise_are_left_out(
     found: list[float], std_deg: float, expected: list[float]
 ) -> None:
     std_m_s2 = float(np.linalg.norm(found) * np.radians(std_deg))
-    suggested = suggested_gravity(np.array(found), np.full(3, std_m_s2))
+    found_m_s2 = np.array(found)
+    suggested = suggested_gravity(found_m_s2, np.full(3, std_m_s2))
     assert suggested.tolist() == pytest.approx(expected, abs=1.5e-4)
     assert not np.any(np.signbit(suggested[suggested == 0.0]))
 
 
 def test_a_component_that_is_known_well_stays_beside_one_that_is_noise() -> None:
     """Moves may show one of the two turns of gravity alone."""
-    suggested = suggested_gravity(np.array([0.069, 0.02, -9.81]), np.array([0.009, 0.09, 0.0]))
+    found_m_s2 = np.array([0.069, 0.02, -9.81])
+    std_m_s2 = np.array([0.009, 0.09, 0.0])
+    suggested = suggested_gravity(found_m_s2, std_m_s2)
     assert suggested[0] == pytest.approx(0.069, abs=1e-4)
     assert suggested[1] == 0.0

@@ -105,4 +105,5 @@ def test_what_both_motors_of_a_differential_have_in_common_is_not_seen_and_leave
 def test_what_a_payload_adds_to_friction_is_no_part_of_the_robot() -> None:
     model = replace(MODEL, friction_by_payload=True)
     standard = _standard({"fs1": 2.0, "fs1_loaded": 0.4, "off2": 0.3}, model)
-    assert [one.name for one in drive_terms(model, standard).left_over] == ["off2"]
+    left_over = drive_terms(model, standard).left_over
+    assert [one.name for one in left_over] == ["off2"]

@@ -44,7 +44,8 @@ def _with_errors(estimate: Estimate, rng: np.random.Generator) -> Estimate:
     errors = directions @ (np.sqrt(np.maximum(sizes, 0.0)) * rng.standard_normal(len(sizes)))
     count = len(estimate.gains)
     gains = estimate.gains + errors[:count]
-    return replace(estimate, gains=gains, parameters=estimate.parameters + errors[count:])
+    parameters = estimate.parameters + errors[count:]
+    return replace(estimate, gains=gains, parameters=parameters)
 
 
 def _index(full: FullParameters, name: str) -> int:
@@ -53,28 +54,35 @@ def _index(full: FullParameters, name: str) -> int:
 
 def test_the_tolerance_is_the_relative_deviation_of_mass_and_second_moments() -> None:
     tolerance = 0.2
-    prior = LinkPrior(ROD.parameters[None], tolerance)
+    links = ROD.parameters[None]
+    prior = LinkPrior(links, tolerance)
     directions = prior.directions()[0]
-    std = dict(zip(LINK_PARAMETERS, np.linalg.norm(directions, axis=1), strict=True))
+    direction_norm = np.linalg.norm(directions, axis=1)
+    std = dict(zip(LINK_PARAMETERS, direction_norm, strict=True))
     assert std["m"] == pytest.approx(tolerance * ROD.mass_kg)
     moments = np.array([pseudo_inertia(column)[:3, :3] for column in directions.T])
     second = pseudo_inertia(ROD.parameters)[:3, :3]
-    for direction in np.random.default_rng(0).normal(size=(20, 3)):
+    rng = np.random.default_rng(0)
+    for direction in rng.normal(size=(20, 3)):
         spread = np.linalg.norm(np.einsum("i,kij,j->k", direction, moments, direction))
         assert spread == pytest.approx(tolerance * direction @ second @ direction)
 
 
 def test_the_prior_is_the_same_in_another_frame() -> None:
-    turn, _ = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))
+    rng = np.random.default_rng(1)
+    turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
     change = np.eye(4)
     change[:3, :3] = turn
     change[:3, 3] = (0.3, -0.2, 0.1)
 
     def moved(link: FloatArray) -> FloatArray:
-        return link_parameters(change @ pseudo_inertia(link) @ change.T)
+        pseudo = change @ pseudo_inertia(link) @ change.T
+        return link_parameters(pseudo)
 
-    here = LinkPrior(ROD.parameters[None], 0.1).directions()[0]
-    there = LinkPrior(moved(ROD.parameters)[None], 0.1).directions()[0]
+    links = ROD.parameters[None]
+    here = LinkPrior(links, 0.1).directions()[0]
+    link_prior = LinkPrior(moved(ROD.parameters)[None], 0.1)
+    there = link_prior.directions()[0]
     expected = np.column_stack([moved(column) for column in here.T])
     assert there @ there.T == pytest.approx(expected @ expected.T, abs=1e-12)
 
@@ -84,7 +92,8 @@ def test_data_and_a_prior_without_errors_give_the_robot(
 ) -> None:
     found = small.identification
     prior = LinkPrior(_links(small_truth), 0.1)
-    full = full_parameters(found.system, _with_truth(found, small_truth), prior)
+    estimate = _with_truth(found, small_truth)
+    full = full_parameters(found.system, estimate, prior)
     assert full.standard == pytest.approx(small_truth.parameters, abs=1e-6)
     assert full.gains == pytest.approx(found.estimate.gains)
     assert full.check.chi_square == pytest.approx(0.0, abs=1e-6)
@@ -105,18 +114,26 @@ def test_sigma_is_true_and_nothing_is_bent(small: Evidence, small_truth: Truth) 
     wrong = 0
     count = 60
     for _ in range(count):
-        links = LinkPrior(_links(small_truth), 0.1).drawn(rng)
-        full = full_parameters(found.system, _with_errors(exact, rng), LinkPrior(links, 0.1))
-        gains.append((full.gains - exact.gains) / full.gains_std)
-        standard.append((full.standard - small_truth.parameters) / full.standard_std)
-        base.append((full.base - exact.parameters[: len(full.base)]) / full.base_std)
+        link_prior = LinkPrior(_links(small_truth), 0.1)
+        links = link_prior.drawn(rng)
+        estimate = _with_errors(exact, rng)
+        prior = LinkPrior(links, 0.1)
+        full = full_parameters(found.system, estimate, prior)
+        gain_difference = full.gains - exact.gains
+        gains.append(gain_difference / full.gains_std)
+        standard_difference = full.standard - small_truth.parameters
+        standard.append(standard_difference / full.standard_std)
+        base_difference = full.base - exact.parameters[: len(full.base)]
+        base.append(base_difference / full.base_std)
         ratios.append((full.check.mass_ratio - 1.0) / full.check.mass_ratio_std)
         wrong += full.check.is_wrong
     for figures in (gains, standard, base):
         assert np.mean(np.abs(figures) < INSIDE) == pytest.approx(0.95, abs=0.03)
-        assert np.sqrt(np.mean(np.square(figures))) == pytest.approx(1.0, abs=0.1)
+        mean_squared_figure = np.mean(np.square(figures))
+        assert np.sqrt(mean_squared_figure) == pytest.approx(1.0, abs=0.1)
         # The mean of each parameter is within chance of its truth, also the largest of them.
-        assert np.abs(np.mean(figures, axis=0)).max() < 4.0 / np.sqrt(count)
+        mean_figure = np.mean(figures, axis=0)
+        assert np.abs(mean_figure).max() < 4.0 / np.sqrt(count)
     assert np.std(ratios) == pytest.approx(1.0, abs=0.3)
     assert wrong <= 3
 
@@ -127,17 +144,23 @@ def test_masses_that_are_thirty_percent_off_are_noticed(
 ) -> None:
     found = small.identification
     exact = _with_truth(found, small_truth)
-    full = full_parameters(found.system, exact, LinkPrior(scale * _links(small_truth), 0.1))
+    links = scale * _links(small_truth)
+    prior = LinkPrior(links, 0.1)
+    full = full_parameters(found.system, exact, prior)
     assert full.check.is_wrong
     assert full.check.mass_ratio == pytest.approx(1.0 / scale, abs=2.0 * full.check.mass_ratio_std)
-    assert np.sign(full.check.mass_ratio - 1.0) == np.sign(1.0 / scale - 1.0)
+    mass_ratio_sign = np.sign(full.check.mass_ratio - 1.0)
+    expected = np.sign(1.0 / scale - 1.0)
+    assert mass_ratio_sign == expected
 
 
 def test_the_link_that_is_wrong_is_named(small: Evidence, small_truth: Truth) -> None:
     found = small.identification
     links = _links(small_truth).copy()
     links[2] *= 1.5
-    full = full_parameters(found.system, _with_truth(found, small_truth), LinkPrior(links, 0.05))
+    estimate = _with_truth(found, small_truth)
+    prior = LinkPrior(links, 0.05)
+    full = full_parameters(found.system, estimate, prior)
     assert 2 in full.check.wrong_links
     assert full.check.link_ratios[2] == pytest.approx(1.0 / 1.5, abs=0.1)
 
@@ -164,7 +187,8 @@ def test_a_rotor_that_is_known_with_its_link_alone_rests_on_the_prior_of_the_lin
     """Izz1 + Ia1 + … is known; the rotor has no prior,
     and the ratio of its σ after and before is zero.
     """
-    full = full_parameters(clean_found.system, clean_found.estimate, LinkPrior(_links(truth), 0.1))
+    prior = LinkPrior(_links(truth), 0.1)
+    full = full_parameters(clean_found.system, clean_found.estimate, prior)
     rotor = _index(full, "Ia1")
     assert np.isinf(full.prior_std[rotor])
     assert full.basis[rotor] is RestsOn.PRIOR
@@ -178,8 +202,10 @@ def test_no_prior_decides_where_the_tolerance_is_wide_and_the_data_are_sharp(
     clean_found: Identification, truth: Truth
 ) -> None:
     """Without noise, base parameters and gains are the data's whatever the prior says."""
-    links = LinkPrior(_links(truth), 0.3).drawn(np.random.default_rng(4))
-    full = full_parameters(clean_found.system, clean_found.estimate, LinkPrior(links, 0.3))
+    link_prior = LinkPrior(_links(truth), 0.3)
+    links = link_prior.drawn(np.random.default_rng(4))
+    prior = LinkPrior(links, 0.3)
+    full = full_parameters(clean_found.system, clean_found.estimate, prior)
     base = clean_found.system.base
     assert full.base == pytest.approx(base.grouping @ truth.parameters, rel=0.02, abs=2e-3)
     assert full.gains == pytest.approx(truth.gains, rel=1e-3)
@@ -192,9 +218,11 @@ def test_what_cannot_exist_is_moved_to_what_can(small: Evidence, small_truth: Tr
     parameters = exact.parameters.copy()
     parameters[names.index("fs2")] = -0.5
     heavy = next(place for place, name in enumerate(names) if name.startswith("Izz1"))
-    parameters[heavy] = -2.0 * abs(parameters[heavy])
+    absolute_parameter = abs(parameters[heavy])
+    parameters[heavy] = -2.0 * absolute_parameter
     prior = LinkPrior(_links(small_truth), 0.3)
-    full = full_parameters(found.system, replace(exact, parameters=parameters), prior)
+    estimate = replace(exact, parameters=parameters)
+    full = full_parameters(found.system, estimate, prior)
     assert full.bounded
     assert full.standard[_index(full, "fs2")] >= 0.0
     assert np.all(full.eigenvalues > 0.0)
@@ -216,7 +244,8 @@ def test_rotors_of_which_the_data_show_the_difference_alone() -> None:
     for joint in (1, 2):
         standard[14 * joint + 10] += 0.3
         standard[14 * joint + 11] += 0.6
-    truth = Truth(model, standard, np.array([33.9, 32.4, -24.2]))
+    gains = np.array([33.9, 32.4, -24.2])
+    truth = Truth(model, standard, gains)
     rng = np.random.default_rng(5)
     runs = [
         record(
@@ -224,11 +253,15 @@ def test_rotors_of_which_the_data_show_the_difference_alone() -> None:
         )
         for number in range(2)
     ]
-    found = identify(model, runs, replace(CONDITIONING, standstill_rad_s=(0.03,) * 3))
-    full = full_parameters(found.system, found.estimate, LinkPrior(_links(truth), 0.1))
+    standstill_rad_s = (0.03,) * 3
+    conditioning = replace(CONDITIONING, standstill_rad_s=standstill_rad_s)
+    found = identify(model, runs, conditioning)
+    prior = LinkPrior(_links(truth), 0.1)
+    full = full_parameters(found.system, found.estimate, prior)
     one = _index(full, "Iam2")
     other = _index(full, "Iam3")
-    assert min(full.standard[one], full.standard[other]) >= 0.0
+    smallest_standard = min(full.standard[one], full.standard[other])
+    assert smallest_standard >= 0.0
     difference = full.standard[one] - full.standard[other]
     assert difference == pytest.approx(0.1, abs=0.1)
     assert full.basis[one] is RestsOn.PRIOR
@@ -245,7 +278,8 @@ def test_fixed_gains_stay(
         gains=small_truth.gains,
         covariance=_without_gains(found.estimate),
     )
-    full = full_parameters(found.system, fixed, LinkPrior(_links(small_truth), 0.1))
+    prior = LinkPrior(_links(small_truth), 0.1)
+    full = full_parameters(found.system, fixed, prior)
     assert full.gains == pytest.approx(small_truth.gains)
     assert full.standard == pytest.approx(small_truth.parameters, abs=1e-6)
     assert np.all(full.gains_std == 0.0)
@@ -263,7 +297,8 @@ def test_least_squares_have_full_parameters_too(small: Evidence, small_truth: Tr
     found = small.identification
     estimate = wls(found.system)
     assert estimate.method is Method.WLS
-    full = full_parameters(found.system, estimate, LinkPrior(_links(small_truth), 0.1))
+    prior = LinkPrior(_links(small_truth), 0.1)
+    full = full_parameters(found.system, estimate, prior)
     assert np.all(full.eigenvalues > 0.0)
 
 
@@ -276,8 +311,10 @@ def test_what_is_no_prior_is_refused(small: Evidence, small_truth: Truth) -> Non
     flat[1, 9] = -1.0
     with pytest.raises(ModelError, match="link 2 of the prior is no possible body"):
         LinkPrior(flat, 0.1)
+    prior = LinkPrior(links[:2], 0.1)
     with pytest.raises(ModelError, match="the prior has 2 moving links, the robot 3"):
-        full_parameters(found.system, found.estimate, LinkPrior(links[:2], 0.1))
+        full_parameters(found.system, found.estimate, prior)
     held = found.system.holding({0: 0.0})
+    link_prior = LinkPrior(links, 0.1)
     with pytest.raises(ModelError, match="the fit has left out Izz1"):
-        full_parameters(held, found.estimate, LinkPrior(links, 0.1))
+        full_parameters(held, found.estimate, link_prior)

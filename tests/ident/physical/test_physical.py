@@ -42,12 +42,14 @@ def _model(
     ratio = np.eye(robot.joint_count)
     if coupled:
         ratio[-1, -2] = 0.7
-    return Model(robot, DriveTrain(RATIO if arm is TX40 else ratio))
+    drive_train = DriveTrain(RATIO if arm is TX40 else ratio)
+    return Model(robot, drive_train)
 
 
 def _motion(model: Model, seed: int, samples: int = 200) -> Motion:
     count = model.robot.joint_count
-    return random_motion(np.repeat([[0.1], [1.5], [2.0], [6.0]], count, axis=1), samples, seed)
+    limits = np.repeat([[0.1], [1.5], [2.0], [6.0]], count, axis=1)
+    return random_motion(limits, samples, seed)
 
 
 def _link(rng: np.random.Generator, size_m: float = 0.1) -> FloatArray:
@@ -89,7 +91,8 @@ def _rows(columns: FloatArray) -> FloatArray:
 
 def _base(model: Model, columns: FloatArray) -> BaseParameters:
     triangle = np.asarray(np.linalg.qr(_rows(columns), mode="r"))
-    rounded = base_parameters(triangle, tuple(column.name for column in model.columns))
+    names = tuple(column.name for column in model.columns)
+    rounded = base_parameters(triangle, names)
     return regroup(model, rounded.names, _rows(columns))
 
 
@@ -123,18 +126,20 @@ def test_a_possible_robot_keeps_its_torque(
 ) -> None:
     model = _model(arm, gravity)
     truth = _truth(model, seed)
-    columns = model.regressor(_motion(model, 1))
+    motion = _motion(model, 1)
+    columns = model.regressor(motion)
     base = _base(model, columns)
-    found = physical_parameters(
-        model, base, base.grouping @ truth, columns, inertia_prior(arm.urdf)
-    )
+    prior = inertia_prior(arm.urdf)
+    found = physical_parameters(model, base, base.grouping @ truth, columns, prior)
     assert found.exact
     _check_possible(found)
     assert np.all(found.eigenvalues >= 0.5 * MARGIN)
     other = model.regressor(_motion(model, 2))
     expected = np.einsum("jck,c->jk", other, truth)
     torque = np.einsum("jck,c->jk", other, found.standard)
-    assert np.linalg.norm(torque - expected) <= 1e-6 * np.linalg.norm(expected)
+    torque_difference_norm = np.linalg.norm(torque - expected)
+    expected_norm = np.linalg.norm(expected)
+    assert torque_difference_norm <= 1e-6 * expected_norm
 
 
 @settings(deadline=None, max_examples=4, derandomize=True)
@@ -143,14 +148,15 @@ def test_a_possible_robot_keeps_its_torque(
 def test_noise_is_projected_and_the_distance_reported(arm: Arm, seed: int) -> None:
     model = _model(arm)
     truth = _truth(model, seed)
-    columns = model.regressor(_motion(model, 1))
+    motion = _motion(model, 1)
+    columns = model.regressor(motion)
     base = _base(model, columns)
     true_values = base.grouping @ truth
-    noise = (
-        0.1 * np.random.default_rng(seed).normal(size=len(true_values)) * np.abs(true_values).mean()
-    )
+    rng = np.random.default_rng(seed)
+    noise = 0.1 * rng.normal(size=len(true_values)) * np.abs(true_values).mean()
     noisy = true_values + noise
-    found = physical_parameters(model, base, noisy, columns, inertia_prior(arm.urdf))
+    prior = inertia_prior(arm.urdf)
+    found = physical_parameters(model, base, noisy, columns, prior)
     _check_possible(found)
     given_torque, found_torque, true_torque = (
         np.einsum("jck,c->jk", columns[:, list(base.independent)], values)
@@ -158,18 +164,24 @@ def test_noise_is_projected_and_the_distance_reported(arm: Arm, seed: int) -> No
     )
     assert np.allclose(found_torque, np.einsum("jck,c->jk", columns, found.standard))
     size = np.linalg.norm(given_torque, axis=1)
-    change = np.linalg.norm(found_torque - given_torque, axis=1) / size
+    found_torque_difference_norm = np.linalg.norm(found_torque - given_torque, axis=1)
+    change = found_torque_difference_norm / size
     assert found.torque_change_percent.axes == pytest.approx(100.0 * change, abs=1e-9)
-    assert found.exact == bool(np.max(change) <= 1e-6)
+    expected = bool(np.max(change) <= 1e-6)
+    assert found.exact == expected
     # The robot without the noise is possible: nothing that is farther away than it may be called
     # the nearest.
-    true_change = np.linalg.norm(true_torque - given_torque, axis=1) / size
-    assert np.linalg.norm(change) <= (1.0 + SLACK) * np.linalg.norm(true_change) + 1e-6
+    true_torque_difference_norm = np.linalg.norm(true_torque - given_torque, axis=1)
+    true_change = true_torque_difference_norm / size
+    change_norm = np.linalg.norm(change)
+    true_change_norm = np.linalg.norm(true_change)
+    assert change_norm <= (1.0 + SLACK) * true_change_norm + 1e-6
 
 
 def test_a_robot_that_is_as_its_urdf_says_is_found_as_such() -> None:
     model = _model(TX40)
-    columns = model.regressor(_motion(model, 1))
+    motion = _motion(model, 1)
+    columns = model.regressor(motion)
     base = _base(model, columns)
     prior = inertia_prior(TX40.urdf)
     truth = _truth(model, 5)
@@ -182,7 +194,8 @@ def test_a_robot_that_is_as_its_urdf_says_is_found_as_such() -> None:
 
 def test_no_other_body_of_the_same_torque_is_nearer_to_the_prior() -> None:
     model = _model(TX40)
-    columns = model.regressor(_motion(model, 1))
+    motion = _motion(model, 1)
+    columns = model.regressor(motion)
     base = _base(model, columns)
     prior = inertia_prior(TX40.urdf)
     found = physical_parameters(model, base, base.grouping @ _truth(model, 5), columns, prior)
@@ -193,22 +206,25 @@ def test_no_other_body_of_the_same_torque_is_nearer_to_the_prior() -> None:
             seen = np.linalg.solve(
                 pseudo_inertia(link), pseudo_inertia(standard[14 * joint : 14 * joint + 10])
             )
-            total += np.trace(seen) - np.linalg.slogdet(seen)[1] - 4.0
+            difference = np.trace(seen) - np.linalg.slogdet(seen)[1]
+            total += difference - 4.0
         return total
 
     _, _, right = np.linalg.svd(base.grouping)
-    scalars = [14 * joint + place for joint in range(6) for place in range(10, 14)] + [84, 85, 86]
-    inertial = np.array(
-        [row for row in right[len(base.names) :] if np.all(np.abs(row[scalars]) < 1e-9)]
-    )
+    places = [14 * joint + place for joint in range(6) for place in range(10, 14)]
+    scalars = [*places, 84, 85, 86]
+    rows = [row for row in right[len(base.names) :] if np.all(np.abs(row[scalars]) < 1e-9)]
+    inertial = np.array(rows)
     least = distance(found.standard)
-    for direction in np.random.default_rng(0).normal(size=(100, len(inertial))) @ inertial:
+    rng = np.random.default_rng(0)
+    for direction in rng.normal(size=(100, len(inertial))) @ inertial:
         assert distance(found.standard + 1e-3 * direction) >= least - 1e-7
 
 
 def test_friction_that_would_push_is_taken_to_zero_unless_it_is_only_a_part() -> None:
     model = _model(TX40)
-    columns = model.regressor(_motion(model, 1))
+    motion = _motion(model, 1)
+    columns = model.regressor(motion)
     base = _base(model, columns)
     index = {column.name: number for number, column in enumerate(model.columns)}
     truth = _truth(model, 6)
@@ -218,33 +234,36 @@ def test_friction_that_would_push_is_taken_to_zero_unless_it_is_only_a_part() ->
     found = physical_parameters(model, base, values, columns, prior)
     assert 0.0 <= found.standard[index["fs3"]] < 0.01
     assert not found.exact
-    partly = physical_parameters(model, base, values, columns, prior, frozenset({2}))
+    other_friction = frozenset({2})
+    partly = physical_parameters(model, base, values, columns, prior, other_friction)
     assert partly.exact
     assert partly.standard[index["fs3"]] == pytest.approx(-0.05)
 
 
 def test_a_coupled_rotor_cannot_give_energy() -> None:
     model = _model(TX40)
-    columns = model.regressor(_motion(model, 1))
+    motion = _motion(model, 1)
+    columns = model.regressor(motion)
     base = _base(model, columns)
     index = {column.name: number for number, column in enumerate(model.columns)}
     truth = _truth(model, 7)
     truth[index["Iam6"]] = 3.0 * np.sqrt(truth[index["Ia5"]] * truth[index["Ia6"]])
-    found = physical_parameters(
-        model, base, base.grouping @ truth, columns, inertia_prior(TX40.urdf)
-    )
+    prior = inertia_prior(TX40.urdf)
+    found = physical_parameters(model, base, base.grouping @ truth, columns, prior)
     assert not found.exact
     _check_possible(found)
 
 
 def test_numbers_that_are_none_are_refused() -> None:
     model = _model(GANTRY)
-    columns = model.regressor(_motion(model, 1))
+    motion = _motion(model, 1)
+    columns = model.regressor(motion)
     base = _base(model, columns)
     values = base.grouping @ _truth(model, 8)
     values[3] = np.nan
+    prior = inertia_prior(GANTRY.urdf)
     with pytest.raises(NotPhysical, match="finite"):
-        physical_parameters(model, base, values, columns, inertia_prior(GANTRY.urdf))
+        physical_parameters(model, base, values, columns, prior)
 
 
 @given(seed=st.integers(0, 10**6))
@@ -252,7 +271,8 @@ def test_the_pseudo_inertia_knows_a_body(seed: int) -> None:
     rng = np.random.default_rng(seed)
     link = _link(rng)
     matrix = pseudo_inertia(link)
-    assert np.linalg.eigvalsh(matrix)[0] > 0.0
+    matrix_eigenvalues = np.linalg.eigvalsh(matrix)
+    assert matrix_eigenvalues[0] > 0.0
     assert link_parameters(matrix) == pytest.approx(link)
     body = body_of(link)
     assert body.parameters == pytest.approx(link)
@@ -268,9 +288,11 @@ def test_the_prior_is_the_urdf_or_a_ball() -> None:
     assert prior.links[:, 9] == pytest.approx([10.0, 3.5, 4.0, 3.5, 1.0, 0.2])
     bare = re.sub(r"(?s)<inertial>.*?</inertial>", "", TX40.urdf)
     ball = inertia_prior(bare)
-    assert ball.assumed == (0, 1, 2, 3, 4, 5)
+    expected = (0, 1, 2, 3, 4, 5)
+    assert ball.assumed == expected
     assert np.all(ball.links[:, 9] == DEFAULT_MASS_KG)
-    broken = inertia_prior(TX40.urdf.replace('izz="0.04"', 'izz="0.4"', 1))
+    urdf = TX40.urdf.replace('izz="0.04"', 'izz="0.4"', 1)
+    broken = inertia_prior(urdf)
     assert broken.assumed == (0,)
     assert broken.links[0, 6:] == pytest.approx(prior.links[0, 6:])
 
@@ -278,12 +300,14 @@ def test_the_prior_is_the_urdf_or_a_ball() -> None:
 @pytest.mark.parametrize("arm", ARMS, ids=[arm.name for arm in ARMS])
 def test_the_grouping_comes_back_from_the_names(arm: Arm) -> None:
     model = _model(arm)
-    columns = model.regressor(_motion(model, 1))
-    base = base_parameters(
-        np.asarray(np.linalg.qr(_rows(columns), mode="r")), tuple(c.name for c in model.columns)
-    )
-    shuffled = np.random.default_rng(0).permutation(base.names)
-    found = regroup(model, tuple(map(str, shuffled)), _rows(model.regressor(_motion(model, 2))))
+    motion = _motion(model, 1)
+    columns = model.regressor(motion)
+    triangle = np.asarray(np.linalg.qr(_rows(columns), mode="r"))
+    base = base_parameters(triangle, tuple(c.name for c in model.columns))
+    rng = np.random.default_rng(0)
+    shuffled = rng.permutation(base.names)
+    names = tuple(map(str, shuffled))
+    found = regroup(model, names, _rows(model.regressor(_motion(model, 2))))
     assert found.independent == base.independent
     assert found.names == base.names
     assert found.grouping == pytest.approx(base.grouping, abs=2e-6)
@@ -291,17 +315,18 @@ def test_the_grouping_comes_back_from_the_names(arm: Arm) -> None:
 
 def test_names_of_another_robot_are_refused() -> None:
     model = _model(TX40)
-    rows = _rows(model.regressor(_motion(model, 1)))
-    names = _base(model, model.regressor(_motion(model, 1))).names
+    motion = _motion(model, 1)
+    rows = _rows(model.regressor(motion))
+    columns = model.regressor(_motion(model, 1))
+    names = _base(model, columns).names
     with pytest.raises(ModelError, match="does not have: Izz9"):
         regroup(model, (*names, "Izz9"), rows)
     with pytest.raises(ModelError, match="lacks fv2"):
         regroup(model, tuple(name for name in names if name != "fv2"), rows)
     with pytest.raises(ModelError, match=f"this robot only {len(names)}"):
         regroup(model, (*names, "Iyy3"), rows)
-    longer = Model(
-        robot_from_urdf(TX40.urdf.replace("0.225 0 0.035", "0.250 0 0.035")), model.drive_train
-    )
+    urdf = TX40.urdf.replace("0.225 0 0.035", "0.250 0 0.035")
+    longer = Model(robot_from_urdf(urdf), model.drive_train)
     with pytest.raises(ModelError, match="geometry"):
         regroup(longer, names, _rows(longer.regressor(_motion(longer, 1))))
 
@@ -313,7 +338,8 @@ def test_links_of_the_prior_are_those_that_pinocchio_moves() -> None:
     model = _model(GANTRY, coupled=False)
     motion = _motion(model, 3, samples=20)
     standard = np.zeros(len(model.columns))
-    for joint, link in enumerate(inertia_prior(GANTRY.urdf).links):
+    links = inertia_prior(GANTRY.urdf).links
+    for joint, link in enumerate(links):
         standard[14 * joint : 14 * joint + 10] = link
     torque = np.einsum("jck,c->jk", model.regressor(motion), standard)
     robot = pin.buildModelFromXML(GANTRY.urdf)

@@ -26,20 +26,24 @@ WIDE = 1e4  #: σ of what has no prior, next to numbers of about one
 
 
 def _grouping() -> FloatArray:
-    motion = random_motion(np.repeat([[0.2], [1.0], [2.0], [5.0]], 7, axis=1), 300, 5)
+    limits = np.repeat([[0.2], [1.0], [2.0], [5.0]], 7, axis=1)
+    motion = random_motion(limits, 300, 5)
     rows = MODEL.regressor(motion).transpose(0, 2, 1).reshape(-1, len(NAMES))
-    return base_parameters(np.asarray(np.linalg.qr(rows, mode="r")), tuple(NAMES)).grouping
+    triangle = np.asarray(np.linalg.qr(rows, mode="r"))
+    return base_parameters(triangle, tuple(NAMES)).grouping
 
 
 def _prior_covariance() -> FloatArray:
-    covariance = WIDE**2 * np.eye(len(NAMES))
+    identity = np.eye(len(NAMES))
+    covariance = WIDE**2 * identity
     for columns, directions in zip(MODEL.link_columns, PRIOR.directions(), strict=True):
         covariance[np.ix_(columns, columns)] = directions @ directions.T
     return covariance
 
 
 def _link_std() -> FloatArray:
-    return np.asarray(np.linalg.norm(PRIOR.directions(), axis=2).ravel())
+    direction_norm = np.linalg.norm(PRIOR.directions(), axis=2)
+    return np.asarray(direction_norm.ravel())
 
 
 def test_shares_are_those_of_the_choice_written_out() -> None:
@@ -51,9 +55,11 @@ def test_shares_are_those_of_the_choice_written_out() -> None:
     # The choice written out, χ = χ₀ + K (β̂ − G χ₀) with K = S Gᵀ (G S Gᵀ)⁻¹: S has numbers in
     # place of limits.
     prior = _prior_covariance()
-    gain = prior @ grouping.T @ np.linalg.inv(grouping @ prior @ grouping.T)
+    inverse = np.linalg.inv(grouping @ prior @ grouping.T)
+    gain = prior @ grouping.T @ inverse
     by_data = np.diag(gain @ covariance @ gain.T)
-    rest = np.eye(len(NAMES)) - gain @ grouping
+    identity = np.eye(len(NAMES))
+    rest = identity - gain @ grouping
     by_prior = np.diag(rest @ prior @ rest.T)
     found = prior_shares(MODEL, grouping, covariance, PRIOR)
     expected = by_prior / (by_prior + by_data)
@@ -63,9 +69,9 @@ def test_shares_are_those_of_the_choice_written_out() -> None:
 
 def test_a_parameter_of_its_own_rests_on_data_and_a_sum_with_a_link_on_the_prior() -> None:
     grouping = _grouping()
-    found = dict(
-        zip(NAMES, prior_shares(MODEL, grouping, 1e-12 * np.eye(len(grouping)), PRIOR), strict=True)
-    )
+    identity = np.eye(len(grouping))
+    covariance = 1e-12 * identity
+    found = dict(zip(NAMES, prior_shares(MODEL, grouping, covariance, PRIOR), strict=True))
     # Only the sum Izz1 + Ia1 is seen; the prior of the link decides on both.
     assert found["Ia1"] > 0.99
     assert found["Izz1"] > 0.99

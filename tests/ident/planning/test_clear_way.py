@@ -31,9 +31,14 @@ NOTHING = Scene((), (), (), None, (), 0.0)
 @pytest.fixture(scope="module")
 def behind_a_wall() -> Checker:
     """An arm that reaches over a wall in front of it, but not through it."""
-    wrist = Capsule("wrist", 3, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.05)
-    wall = Box("wall", (0.2, -0.02, 0.0), (0.8, 0.02, 0.45))
-    return Checker(robot_from_urdf(TX40.urdf), Scene((wrist,), (), (wall,), None, (), 0.01))
+    start_m = (0.0, 0.0, 0.0)
+    end_m = (0.0, 0.0, 0.0)
+    wrist = Capsule("wrist", 3, start_m, end_m, 0.05)
+    lower_m = (0.2, -0.02, 0.0)
+    upper_m = (0.8, 0.02, 0.45)
+    wall = Box("wall", lower_m, upper_m)
+    scene = Scene((wrist,), (), (wall,), None, (), 0.01)
+    return Checker(robot_from_urdf(TX40.urdf), scene)
 
 
 def _legs(
@@ -49,7 +54,8 @@ def test_the_way_around_a_wall_is_clear_and_stays_within_the_limits(
 ) -> None:
     start, end = (STRETCHED + np.array([side, 0.0, 0.0, 0.0, 0.0, 0.0]) for side in (-0.8, 0.8))
     assert behind_a_wall.obstruction(start, end) is not None
-    way = clear_way(behind_a_wall, start, end, -LIMIT, LIMIT, np.random.default_rng(seed))
+    rng = np.random.default_rng(seed)
+    way = clear_way(behind_a_wall, start, end, -LIMIT, LIMIT, rng)
     assert way
     for one, other in _legs(start, way, end):
         assert behind_a_wall.obstruction(one, other) is None
@@ -59,7 +65,8 @@ def test_the_way_around_a_wall_is_clear_and_stays_within_the_limits(
 def test_a_clear_straight_way_has_no_turns(behind_a_wall: Checker) -> None:
     start = STRETCHED - 0.8 * np.eye(6)[0]
     end = STRETCHED - 1.2 * np.eye(6)[0]
-    assert clear_way(behind_a_wall, start, end, -LIMIT, LIMIT, np.random.default_rng(0)) == ()
+    rng = np.random.default_rng(0)
+    assert clear_way(behind_a_wall, start, end, -LIMIT, LIMIT, rng) == ()
 
 
 def test_no_way_is_found_where_the_room_has_none(behind_a_wall: Checker) -> None:
@@ -68,7 +75,8 @@ def test_no_way_is_found_where_the_room_has_none(behind_a_wall: Checker) -> None
     end = STRETCHED + 0.8 * np.eye(6)[0]
     lower = np.minimum(start, end)
     upper = np.maximum(start, end)
-    assert clear_way(behind_a_wall, start, end, lower, upper, np.random.default_rng(0)) is None
+    rng = np.random.default_rng(0)
+    assert clear_way(behind_a_wall, start, end, lower, upper, rng) is None
 
 
 @given(st.integers(0, 1000))
@@ -78,7 +86,9 @@ def test_motors_of_a_redundant_drive_fit_each_other_on_the_whole_way(seed: int) 
     rng = np.random.default_rng(seed)
     limit = np.full(4, 0.5)
     start, end = (_walked(checker, limit, rng) for _ in range(2))
-    way = clear_way(checker, start, end, checker.home - limit, checker.home + limit, rng)
+    lower = checker.home - limit
+    upper = checker.home + limit
+    way = clear_way(checker, start, end, lower, upper, rng)
     assert way is not None
     for one, other in _legs(start, way, end):
         assert checker.obstruction(one, other) is None
@@ -89,8 +99,8 @@ def _walked(checker: Checker, limit: FloatArray, rng: np.random.Generator) -> Fl
     here = checker.home
     for _ in range(4):
         target = checker.home + rng.uniform(-limit, limit)
-        reached = farthest_towards(
-            checker, here, target, checker.home - limit, checker.home + limit
-        )
+        lower = checker.home - limit
+        upper = checker.home + limit
+        reached = farthest_towards(checker, here, target, lower, upper)
         here = here if reached is None else reached
     return here

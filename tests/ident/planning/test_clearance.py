@@ -18,15 +18,22 @@ FloatArray = NDArray[np.float64]
 
 
 def _scene(last: int, minimum_m: float = 0.01) -> Scene:
+    start_m = (0.0, 0.0, 0.0)
+    capsule = Capsule("column", BASE, start_m, (0.0, 0.0, 0.25), 0.07)
+    end_m = (0.18, 0.0, 0.03)
     capsules = (
-        Capsule("column", BASE, (0.0, 0.0, 0.0), (0.0, 0.0, 0.25), 0.07),
-        Capsule("upper", 1, (0.0, 0.0, 0.0), (0.18, 0.0, 0.03), 0.06),
+        capsule,
+        Capsule("upper", 1, (0.0, 0.0, 0.0), end_m, 0.06),
         Capsule("tool", last, (0.0, 0.0, 0.05), (0.0, 0.02, 0.2), 0.05),
         Capsule("ball", last, (0.05, 0.0, 0.1), (0.05, 0.0, 0.1), 0.04),
     )
-    boxes = (Box("post", (0.3, -0.6, 0.0), (0.31, 0.6, 0.7)),)
-    workspace = Box("workspace", (-1.5, -1.5, -0.2), (1.5, 1.5, 1.5))
-    return Scene(capsules, ((0, 2), (1, 2), (0, 3)), boxes, workspace, (2, 3), minimum_m)
+    lower_m = (0.3, -0.6, 0.0)
+    box = Box("post", lower_m, (0.31, 0.6, 0.7))
+    boxes = (box,)
+    upper_m = (1.5, 1.5, 1.5)
+    workspace = Box("workspace", (-1.5, -1.5, -0.2), upper_m)
+    pairs = ((0, 2), (1, 2), (0, 3))
+    return Scene(capsules, pairs, boxes, workspace, (2, 3), minimum_m)
 
 
 @pytest.mark.parametrize("arm", ARMS, ids=lambda arm: arm.name)
@@ -34,14 +41,14 @@ def test_poses_are_those_of_pinocchio(arm: Arm) -> None:
     robot = robot_from_urdf(arm.urdf)
     model = pin.buildModelFromXML(arm.urdf)
     data = model.createData()
-    positions = np.random.default_rng(0).uniform(-2.0, 2.0, (model.nq, 5))
+    rng = np.random.default_rng(0)
+    positions = rng.uniform(-2.0, 2.0, (model.nq, 5))
     found = poses(robot, positions.T)
     for sample in range(5):
         pin.forwardKinematics(model, data, positions[:, sample])
         for joint in range(model.nq):
-            assert found.origin_m[joint + 1, sample] == pytest.approx(
-                data.oMi[joint + 1].translation, abs=1e-12
-            )
+            translation = data.oMi[joint + 1].translation
+            assert found.origin_m[joint + 1, sample] == pytest.approx(translation, abs=1e-12)
             assert found.rotation[joint + 1, sample] == pytest.approx(
                 data.oMi[joint + 1].rotation, abs=1e-12
             )
@@ -51,23 +58,27 @@ def _segment_distance(a0: FloatArray, a1: FloatArray, b0: FloatArray, b1: FloatA
     """By brute force."""
     grid = np.linspace(0.0, 1.0, 201)
     first, second = (p + grid[:, None] * (q - p) for p, q in ((a0, a1), (b0, b1)))
-    return float(np.linalg.norm(first[:, None] - second[None], axis=2).min())
+    difference = first[:, None] - second[None]
+    difference_norm = np.linalg.norm(difference, axis=2)
+    return float(difference_norm.min())
 
 
 def test_distances_are_those_of_the_segments() -> None:
     robot = robot_from_urdf(TX40.urdf)
     scene = _scene(5)
-    bare = Scene(scene.capsules[:3], ((0, 2),), (), None, (), 0.01)
+    pairs = ((0, 2),)
+    bare = Scene(scene.capsules[:3], pairs, (), None, (), 0.01)
     checker = Checker(robot, bare)
     rng = np.random.default_rng(1)
     for _ in range(20):
         position = rng.uniform(-2.0, 2.0, (1, 6))
         at = poses(robot, position)
-        ends = [
-            at.origin_m[c.link + 1, 0] + at.rotation[c.link + 1, 0] @ np.array(point)
-            for c in (bare.capsules[0], bare.capsules[2])
-            for point in (c.start_m, c.end_m)
-        ]
+        ends = []
+        for c in (bare.capsules[0], bare.capsules[2]):
+            for point in (c.start_m, c.end_m):
+                ends.append(
+                    at.origin_m[c.link + 1, 0] + at.rotation[c.link + 1, 0] @ np.array(point)
+                )
         expected = _segment_distance(*ends) - 0.07 - 0.05 - 0.01
         assert float(checker.margins(position)[0]) == pytest.approx(expected, abs=1e-3)
 
@@ -76,7 +87,8 @@ def test_distances_are_those_of_the_segments() -> None:
 def test_a_way_that_is_called_clear_is_clear_everywhere(arm: Arm) -> None:
     robot = robot_from_urdf(arm.urdf)
     count = robot.joint_count
-    checker = Checker(robot, _scene(count - 1))
+    scene = _scene(count - 1)
+    checker = Checker(robot, scene)
     verdicts = []
 
     @settings(deadline=None, max_examples=60, derandomize=True)
@@ -88,8 +100,10 @@ def test_a_way_that_is_called_clear_is_clear_everywhere(arm: Arm) -> None:
         found = checker.obstruction(start, end)
         verdicts.append(found is None)
         if found is None:
-            along = start + (end - start) * np.linspace(0.0, 1.0, 800)[:, None]
-            assert float(checker.margins(along).min()) >= 0.0
+            grid = np.linspace(0.0, 1.0, 800)
+            along = start + (end - start) * grid[:, None]
+            smallest = checker.margins(along).min()
+            assert float(smallest) >= 0.0
         else:
             there = np.array(found.position)[None]
             assert float(checker.margins(there)[0]) <= RESOLUTION_M
@@ -101,14 +115,18 @@ def test_a_way_that_is_called_clear_is_clear_everywhere(arm: Arm) -> None:
 
 def test_a_thin_wall_between_two_free_postures_is_found() -> None:
     robot = robot_from_urdf(TX40.urdf)
-    wall = Box("wall", (0.1, -0.002, 0.0), (1.5, 0.002, 1.0))
-    scene = Scene(
-        (Capsule("tool", 5, (0.0, 0.0, 0.02), (0.0, 0.0, 0.05), 0.01),), (), (wall,), None, (), 0.0
-    )
+    lower_m = (0.1, -0.002, 0.0)
+    upper_m = (1.5, 0.002, 1.0)
+    wall = Box("wall", lower_m, upper_m)
+    start_m = (0.0, 0.0, 0.02)
+    end_m = (0.0, 0.0, 0.05)
+    capsules = (Capsule("tool", 5, start_m, end_m, 0.01),)
+    scene = Scene(capsules, (), (wall,), None, (), 0.0)
     checker = Checker(robot, scene)
     start = np.array([-1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
     end = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
-    assert (checker.margins(np.stack((start, end))) > 0.05).all()
+    position = np.stack((start, end))
+    assert (checker.margins(position) > 0.05).all()
     found = checker.obstruction(start, end)
     assert found is not None
     assert (found.first, found.second) == ("tool", "wall")
@@ -118,9 +136,14 @@ def test_a_thin_wall_between_two_free_postures_is_found() -> None:
 
 def test_what_leaves_the_workspace_is_named() -> None:
     robot = robot_from_urdf(TX40.urdf)
-    tool = Capsule("tool", 5, (0.0, 0.0, 0.0), (0.0, 0.0, 0.1), 0.02)
-    low = Box("workspace", (-2.0, -2.0, 0.3), (2.0, 2.0, 2.0))
-    checker = Checker(robot, Scene((tool,), (), (), low, (0,), 0.0))
+    start_m = (0.0, 0.0, 0.0)
+    end_m = (0.0, 0.0, 0.1)
+    tool = Capsule("tool", 5, start_m, end_m, 0.02)
+    lower_m = (-2.0, -2.0, 0.3)
+    upper_m = (2.0, 2.0, 2.0)
+    low = Box("workspace", lower_m, upper_m)
+    scene = Scene((tool,), (), (), low, (0,), 0.0)
+    checker = Checker(robot, scene)
     up = np.zeros(6)
     down = np.array([0.0, 2.0, 0.5, 0.0, 0.0, 0.0])
     assert float(checker.margins(up[None])[0]) > 0.0
@@ -131,6 +154,8 @@ def test_what_leaves_the_workspace_is_named() -> None:
 
 def test_nothing_declared_is_always_clear() -> None:
     robot = robot_from_urdf(TX40.urdf)
-    checker = Checker(robot, Scene((), (), (), None, (), 0.0))
+    scene = Scene((), (), (), None, (), 0.0)
+    checker = Checker(robot, scene)
     assert checker.obstruction(np.zeros(6), np.ones(6)) is None
-    assert np.isinf(checker.margins(np.zeros((3, 6)))).all()
+    position = np.zeros((3, 6))
+    assert np.isinf(checker.margins(position)).all()

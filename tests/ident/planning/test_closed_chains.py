@@ -36,11 +36,15 @@ FloatArray = NDArray[np.float64]
 
 def _design(mechanism: Mechanism, made: Made, noise_a: FloatArray) -> Design:
     parameters = made.standard
-    payload = ExpectedPayload(frozenset({"m"}), made.payload)
+    known = frozenset({"m"})
+    payload = ExpectedPayload(known, made.payload)
     expectation = Expectation(made.model, mechanism.gains, parameters, (payload,), noise_a)
-    data = differentiate(made.runs[0], made.model.drive_train, made.conditioning)
+    run = made.runs[0]
+    data = differentiate(run, made.model.drive_train, made.conditioning)
     every = slice(None, None, 7)
-    return Design(expectation, visible_base(made.model, data.motion(every)))
+    motion = data.motion(every)
+    base = visible_base(made.model, motion)
+    return Design(expectation, base)
 
 
 @pytest.mark.parametrize("mechanism", [FIVE_BAR, PLANAR], ids=lambda one: one.name)
@@ -52,20 +56,25 @@ def test_the_predicted_deviation_is_that_of_a_fit(mechanism: Mechanism) -> None:
     for run, payload in zip(made.runs, (None, 0), strict=True):
         data = differentiate(run, made.model.drive_train, made.conditioning)
         information += design.information(recorded(made.model, data, made.conditioning), (payload,))
-    expected = 100.0 * fitted.gains_std / np.abs(fitted.gains)
+    absolute_gain = np.abs(fitted.gains)
+    expected = 100.0 * fitted.gains_std / absolute_gain
     ratio = design.std_percent(information) / expected
     assert np.all((ratio > 0.5) & (ratio < 2.0))
 
 
 def test_moves_show_every_gain_of_a_redundant_drive_and_rest_shows_none() -> None:
     made = made_of(PLANAR, 3, seconds=18.0, preload_nm=0.0)
-    design = _design(PLANAR, made, np.full(4, 0.01))
-    data = differentiate(made.runs[1], made.model.drive_train, made.conditioning)
+    noise_a = np.full(4, 0.01)
+    design = _design(PLANAR, made, noise_a)
+    run = made.runs[1]
+    data = differentiate(run, made.model.drive_train, made.conditioning)
     moves = recorded(made.model, data, made.conditioning)
     still = np.repeat(data.position_rad[:1], 60, axis=0)
-    rest = Excitation(
-        Motion(still, np.zeros_like(still), np.zeros_like(still)), np.ones((4, 60), dtype=np.bool_)
-    )
+    velocity_rad_s = np.zeros_like(still)
+    acceleration_rad_s2 = np.zeros_like(still)
+    motion = Motion(still, velocity_rad_s, acceleration_rad_s2)
+    use = np.ones((4, 60), dtype=np.bool_)
+    rest = Excitation(motion, use)
     runs: tuple[int | None, ...] = (None, 0)
     assert np.all(design.std_percent(design.information(moves, runs)) < UNSEEN_PERCENT)
     assert not np.any(design.std_percent(design.information(rest, runs)) < UNSEEN_PERCENT)
@@ -113,7 +122,8 @@ def _spread_with_known_preload(rows: Observation, noise_a: FloatArray) -> FloatA
         scale = np.linalg.norm(matrix, axis=0)
         right = np.concatenate([weight[axis] * known[axis, use] for axis in range(count)])
         found.append((np.linalg.lstsq(matrix / scale, right)[0] / scale)[:count])
-    return np.asarray(100.0 * np.std(found, axis=0) / np.abs(PLANAR.gains))
+    absolute_gain = np.abs(PLANAR.gains)
+    return np.asarray(100.0 * np.std(found, axis=0) / absolute_gain)
 
 
 def test_preload_hides_gains_while_the_pose_hardly_changes() -> None:
@@ -125,13 +135,17 @@ def test_preload_hides_gains_while_the_pose_hardly_changes() -> None:
     identified = identify(made.model, made.runs, made.conditioning, keep_rows=True)
     fitted = identified.estimate
     assert identified.gathered is not None
-    judged = _judged(made, _design(PLANAR, made, fitted.axis_noise))
+    design = _design(PLANAR, made, fitted.axis_noise)
+    judged = _judged(made, design)
     predicted = np.array([(gain.std_percent, gain.known_preload_percent) for gain in judged.gains])
+    rows = identified.gathered[1]
+    absolute_gain = np.abs(fitted.gains)
     fits = (
-        100.0 * fitted.gains_std / np.abs(fitted.gains),
-        _spread_with_known_preload(identified.gathered[1], fitted.axis_noise),
+        100.0 * fitted.gains_std / absolute_gain,
+        _spread_with_known_preload(rows, fitted.axis_noise),
     )
-    ratio = np.stack(fits, axis=1) / predicted
+    stacked_fits = np.stack(fits, axis=1)
+    ratio = stacked_fits / predicted
     assert np.all((ratio > 0.5) & (ratio < 2.0))
     assert np.all(predicted[:, 0] > 2.5 * predicted[:, 1])
     louder = _judged(made, _design(PLANAR, made, 12.0 * fitted.axis_noise))
@@ -145,16 +159,21 @@ def test_a_five_bar_goes_where_its_rods_reach() -> None:
     checker = Checker(FIVE_BAR.robot, NOTHING)
     far = float(np.arccos((2.0 * ROD_M - BASE_M) / (2.0 * CRANK_M)))
     home = checker.home
-    stretched = np.array([np.pi - far, far])
-    assert checker.margins(np.array([home]))[0] == np.inf
+    difference = np.pi - far
+    stretched = np.array([difference, far])
+    position = np.array([home])
+    assert checker.margins(position)[0] == np.inf
     apart = np.array([0.1, -0.1])
-    assert (checker.margins(stretched + np.array([[0.0], [1.0]]) * apart) == -np.inf).all()
+    stretched_position = stretched + np.array([[0.0], [1.0]]) * apart
+    assert (checker.margins(stretched_position) == -np.inf).all()
     found = checker.obstruction(home, stretched)
     assert found is not None
     assert found.first == "the closures"
     assert checker.obstruction(home, home + 0.2) is None
     shares = home + np.array([[1.0], [0.5], [0.1]]) * (stretched - home)
-    farthest = checker.farthest(home, shares, home - 1.0, home + 1.0)
+    lower = home - 1.0
+    upper = home + 1.0
+    farthest = checker.farthest(home, shares, lower, upper)
     assert farthest is not None
     assert not np.array_equal(farthest, shares[0])
 
@@ -167,25 +186,37 @@ def test_motors_of_a_redundant_drive_are_made_to_fit() -> None:
     assert checker.margins(fitting[None])[0] == np.inf
     assert checker.fitting(fitting) == pytest.approx(fitting, abs=1e-9)
     # Where that is beyond a limit, it is no place to go to.
-    near = checker.home + 0.05 * (wanted - checker.home)
+    difference = wanted - checker.home
+    near = checker.home + 0.05 * difference
     there = checker.fitting(near)
-    everywhere = checker.farthest(checker.home, near[None], there - 1e-6, there + 1e-6)
+    lower = there - 1e-6
+    upper = there + 1e-6
+    everywhere = checker.farthest(checker.home, near[None], lower, upper)
     assert everywhere == pytest.approx(there)
-    assert checker.farthest(checker.home, near[None], there - 1.0, there - 1e-6) is None
-    poses = axis_positions(PLANAR, np.random.default_rng(0), 6.0)[::300]
-    way = np.linspace(0.0, 1.0, 21)[:, None]
-    straight = poses[0] + way * (poses[-1] - poses[0])
+    there_lower = there - 1.0
+    there_upper = there - 1e-6
+    assert checker.farthest(checker.home, near[None], there_lower, there_upper) is None
+    rng = np.random.default_rng(0)
+    poses = axis_positions(PLANAR, rng, 6.0)[::300]
+    grid = np.linspace(0.0, 1.0, 21)
+    way = grid[:, None]
+    pose_difference = poses[-1] - poses[0]
+    straight = poses[0] + way * pose_difference
     misfit = np.max(np.abs(checker.fitting(straight) - straight))
-    assert (checker.obstruction(poses[0], poses[-1]) is None) == (misfit < LARGEST_PLANNED_MISFIT)
+    last_pose = poses[-1]
+    assert (checker.obstruction(poses[0], last_pose) is None) == (misfit < LARGEST_PLANNED_MISFIT)
 
 
 def test_bodies_of_a_closed_chain_keep_apart() -> None:
     tip = next(
         index for index, joint in enumerate(FIVE_BAR.robot.joints) if joint.name == "left-rod"
     )
-    post = Capsule("post", -1, (0.0, 0.66, 0.0), (0.0, 0.66, 0.3), 0.02)
-    own = Capsule("tip", tip, (ROD_M, 0.0, 0.0), (ROD_M, 0.0, 0.01), 0.02)
-    scene = Scene((own, post), ((0, 1),), (), None, (), 0.01)
+    start_m = (0.0, 0.66, 0.0)
+    post = Capsule("post", -1, start_m, (0.0, 0.66, 0.3), 0.02)
+    end_m = (ROD_M, 0.0, 0.01)
+    own = Capsule("tip", tip, (ROD_M, 0.0, 0.0), end_m, 0.02)
+    pairs = ((0, 1),)
+    scene = Scene((own, post), pairs, (), None, (), 0.01)
     checker = Checker(FIVE_BAR.robot, scene)
     found = checker.obstruction(checker.home, np.array([1.7, 1.44]))
     assert found is not None

@@ -34,14 +34,17 @@ def _segments(seed: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray
 
 
 def _capsule(start: FloatArray, end: FloatArray) -> tuple[coal.CollisionGeometry, coal.Transform3s]:
-    length = float(np.linalg.norm(end - start))
+    difference_norm = np.linalg.norm(end - start)
+    length = float(difference_norm)
     if length == 0.0:
         return coal.Sphere(RADIUS_M), coal.Transform3s(np.eye(3), start)
     z = (end - start) / length
     x = np.cross(np.eye(3)[np.argmin(np.abs(z))], z)
     x /= np.linalg.norm(x)
     rotation = np.column_stack((x, np.cross(z, x), z))
-    return coal.Capsule(RADIUS_M, length), coal.Transform3s(rotation, (start + end) / 2)
+    capsule = coal.Capsule(RADIUS_M, length)
+    transform3s = coal.Transform3s(rotation, (start + end) / 2)
+    return capsule, transform3s
 
 
 def _distance(
@@ -55,7 +58,8 @@ def test_distances_of_capsules_are_those_of_coal() -> None:
     ends = _segments(0)
     expected = [_distance(_capsule(a, b), _capsule(c, d)) for a, b, c, d in zip(*ends, strict=True)]
     found = segment_to_segment(*ends)
-    assert np.abs(found - 2.0 * RADIUS_M - expected).max() < 1e-9
+    absolute_expected = np.abs(found - 2.0 * RADIUS_M - expected)
+    assert absolute_expected.max() < 1e-9
     assert (found == 0.0).any()  # segments of the grid that cross
 
 
@@ -70,7 +74,8 @@ def test_distances_to_boxes_and_depths_inside_are_those_of_coal() -> None:
         for a, b, low, high in zip(start, end, lower, upper, strict=True)
     ]
     found = segment_to_box(start, end, lower, upper)
-    assert np.abs(found - RADIUS_M - expected).max() < ITERATED_M
+    absolute_radius_m = np.abs(found - RADIUS_M - expected)
+    assert absolute_radius_m.max() < ITERATED_M
     assert 0.05 < (found < 0.0).mean() < 0.95
 
 

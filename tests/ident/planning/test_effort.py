@@ -42,19 +42,30 @@ URDF = f"""
 @pytest.fixture(scope="module")
 def expectation() -> Expectation:
     """A pendulum about the y axis, its rod along x, with dry and viscous friction and a rotor."""
-    robot = robot_from_urdf(URDF, (0.0, 0.0, -GRAVITY_M_S2))
-    model = Model(robot, DriveTrain(np.eye(1)))
-    rod = Body(MASS_KG, np.array([LEVER_M, 0.0, 0.0]), INERTIA_KG_M2 * np.eye(3))
-    body = Body(PAYLOAD_KG, np.array([PAYLOAD_LEVER_M, 0.0, 0.0]), np.zeros((3, 3)))
-    parameters = nominal_parameters(
-        model, np.array([rod.parameters]), np.array([EFFORT_NM]), np.array([2.0]), np.array([10.0])
-    )
+    gravity_m_s2 = (0.0, 0.0, -GRAVITY_M_S2)
+    robot = robot_from_urdf(URDF, gravity_m_s2)
+    drive_train = DriveTrain(np.eye(1))
+    model = Model(robot, drive_train)
+    centre_m = np.array([LEVER_M, 0.0, 0.0])
+    rod = Body(MASS_KG, centre_m, INERTIA_KG_M2 * np.eye(3))
+    inertia_kg_m2 = np.zeros((3, 3))
+    body = Body(PAYLOAD_KG, np.array([PAYLOAD_LEVER_M, 0.0, 0.0]), inertia_kg_m2)
+    links = np.array([rod.parameters])
+    torque_limit = np.array([EFFORT_NM])
+    velocity_limit = np.array([2.0])
+    acceleration_limit = np.array([10.0])
+    parameters = nominal_parameters(model, links, torque_limit, velocity_limit, acceleration_limit)
     mounted = ExpectedPayload(frozenset(LINK_PARAMETERS), body.parameters)
-    return Expectation(model, np.ones(1), parameters, (mounted,), np.ones(1))
+    gains = np.ones(1)
+    noise_a = np.ones(1)
+    return Expectation(model, gains, parameters, (mounted,), noise_a)
 
 
 def _motion(position: float, velocity: float, acceleration: float) -> Motion:
-    return Motion(np.array([[position]]), np.array([[velocity]]), np.array([[acceleration]]))
+    position_rad = np.array([[position]])
+    velocity_rad_s = np.array([[velocity]])
+    acceleration_rad_s2 = np.array([[acceleration]])
+    return Motion(position_rad, velocity_rad_s, acceleration_rad_s2)
 
 
 @pytest.mark.parametrize(
@@ -78,11 +89,14 @@ def test_torque_of_a_pendulum_is_that_by_hand(
     assert axis_torques(expectation, motion, 0)[0, 0] == pytest.approx(bare_nm + added_nm)
     effort = declared_efforts(expectation.model, URDF)
     share = effort_shares(expectation, effort, motion, (None, 0))[0, 0]
-    assert share == pytest.approx(max(abs(bare_nm), abs(bare_nm + added_nm)) / EFFORT_NM)
+    absolute_bare_nm = abs(bare_nm + added_nm)
+    largest_bare_nm = max(abs(bare_nm), absolute_bare_nm)
+    assert share == pytest.approx(largest_bare_nm / EFFORT_NM)
 
 
 def test_an_effort_that_gravity_exceeds_is_no_limit(expectation: Expectation) -> None:
-    position = np.linspace(-3.0, 3.0, 101)[:, None]
+    grid = np.linspace(-3.0, 3.0, 101)
+    position = grid[:, None]
     bare_nm = MASS_KG * GRAVITY_M_S2 * LEVER_M
     loaded_nm = bare_nm + PAYLOAD_KG * GRAVITY_M_S2 * PAYLOAD_LEVER_M
     enough = np.array([loaded_nm + 0.1])

@@ -56,17 +56,19 @@ def _design(
     known: frozenset[str] = frozenset({"m"}),
     gravity: tuple[float, ...] = (0, 0, -9.81),
 ) -> Design:
-    robot = replace(truth.model.robot, gravity_m_s2=np.array(gravity, dtype=np.float64))
+    gravity_m_s2 = np.array(gravity, dtype=np.float64)
+    robot = replace(truth.model.robot, gravity_m_s2=gravity_m_s2)
     model = replace(truth.model, robot=robot)
     # White noise at 250 Hz, of which rows at 50 a second keep the band below 20 Hz: s²/5 for what
     # is slower.
     noise = np.full(
         6, NOISE_A / np.sqrt(decimator(RATE_HZ, CONDITIONING.decimation_cutoff_hz).factor)
     )
-    expectation = Expectation(
-        model, truth.gains, truth.parameters, (ExpectedPayload(known, PAYLOAD),), noise
-    )
-    return Design(expectation, visible_base(model, _motion(np.random.default_rng(5), 900)))
+    payloads = (ExpectedPayload(known, PAYLOAD),)
+    expectation = Expectation(model, truth.gains, truth.parameters, payloads, noise)
+    rng = np.random.default_rng(5)
+    motion = _motion(rng, 900)
+    return Design(expectation, visible_base(model, motion))
 
 
 def _motion(rng: np.random.Generator, rows: int, still: int | None = None) -> Motion:
@@ -112,7 +114,8 @@ def test_predicted_deviations_are_those_of_the_estimator(truth: Truth) -> None:
     ratio = np.sqrt(np.mean(np.square(errors), axis=0)) / predicted
     # 12 draws know a deviation to 20 %, all six together (the wrist gains go together) to some 12
     # %.
-    assert 0.7 < float(np.sqrt(np.mean(ratio**2))) < 1.3
+    rms_ratio = np.sqrt(np.mean(ratio**2))
+    assert 0.7 < float(rms_ratio) < 1.3
     assert ratio.min() > 0.45
     assert ratio.max() < 1.6
 
@@ -136,12 +139,8 @@ def test_the_information_is_that_of_the_fits_own_equation() -> None:
         if loaded:
             torque += np.einsum("jck,c->jk", regressor[:, truth.model.flange], payload)
         gains = GAINS * np.exp(values[-6:])
-        weighted = (
-            truth.model.drive_train.to_motor
-            @ torque
-            / gains[:, None]
-            / design.expectation.noise_a[:, None]
-        )
+        to_motor = truth.model.drive_train.to_motor
+        weighted = to_motor @ torque / gains[:, None] / design.expectation.noise_a[:, None]
         return np.asarray(weighted.ravel())
 
     jacobian = np.zeros((2 * 6 * 40, len(start)))
@@ -155,7 +154,8 @@ def test_the_information_is_that_of_the_fits_own_equation() -> None:
         jacobian[:, column] = np.concatenate(both) / 2e-5
     found = design.information(excitation, (None, 0))
     scale = np.sqrt(np.diag(found))
-    assert jacobian.T @ jacobian / np.outer(scale, scale) == pytest.approx(
+    scale_outer = np.outer(scale, scale)
+    assert jacobian.T @ jacobian / scale_outer == pytest.approx(
         found / np.outer(scale, scale), abs=1e-6
     )
 
@@ -165,16 +165,18 @@ def test_the_information_is_that_of_the_fits_own_equation() -> None:
 def test_deviations_scale_with_noise_and_repetition(seed: int, factor: float, times: int) -> None:
     truth = tx40_truth()
     design = _design(truth)
-    louder = Design(
-        replace(design.expectation, noise_a=factor * design.expectation.noise_a), design.base
-    )
-    excitation = _excitation(np.random.default_rng(seed))
+    noise_a = factor * design.expectation.noise_a
+    expectation = replace(design.expectation, noise_a=noise_a)
+    louder = Design(expectation, design.base)
+    rng = np.random.default_rng(seed)
+    excitation = _excitation(rng)
     once = design.std_percent(design.information(excitation, (None, 0)))
     noisy = louder.std_percent(louder.information(excitation, (None, 0)))
     often = design.std_percent(times * design.information(excitation, (None, 0)))
     assert noisy == pytest.approx(factor * once, rel=1e-6)
     assert often == pytest.approx(once / np.sqrt(times), rel=1e-6)
-    rank = louder.rank(louder.information(excitation, (None, 0)))
+    information = louder.information(excitation, (None, 0))
+    rank = louder.rank(information)
     assert 0 <= rank <= louder.rank(times * louder.information(excitation, (None, 0))) <= len(GAINS)
     # Each gain is a sum of independent directions with squares of weights that add up to one.
     assert rank < len(GAINS) or (noisy <= UNSEEN_PERCENT * (1.0 + 1e-9)).all()
@@ -188,16 +190,19 @@ def test_deviations_scale_with_noise_and_repetition(seed: int, factor: float, ti
 
 def test_recorded_information_is_the_sum_of_the_runs() -> None:
     design = _design(tx40_truth())
-    bare = _excitation(np.random.default_rng(1), 60)
+    rng = np.random.default_rng(1)
+    bare = _excitation(rng, 60)
     loaded = _excitation(np.random.default_rng(2), 60)
-    found = recorded_information(design, [(bare, (None,)), (loaded, (0,))])
+    runs = [(bare, (None,)), (loaded, (0,))]
+    found = recorded_information(design, runs)
     expected = design.information(bare, (None,)) + design.information(loaded, (0,))
     assert found == pytest.approx(expected)
     assert not recorded_information(design, []).any()
 
 
 def test_correlated_rows_say_less() -> None:
-    assert effective_noise(np.ones(2), 0.0) == pytest.approx([1.0, 1.0])
+    noise_a = np.ones(2)
+    assert effective_noise(noise_a, 0.0) == pytest.approx([1.0, 1.0])
     # The mean of a long first-order autoregression, by its definition: Σ_k ρ^|k| times the
     # variance.
     rho = 0.67
@@ -207,7 +212,8 @@ def test_correlated_rows_say_less() -> None:
 
 def test_without_a_known_payload_no_gain_is_seen() -> None:
     truth = tx40_truth()
-    excitation = _excitation(np.random.default_rng(1))
+    rng = np.random.default_rng(1)
+    excitation = _excitation(rng)
     for design, payloads in (
         (_design(truth, frozenset()), (None, 0)),
         (_design(truth), (None,)),
@@ -218,10 +224,12 @@ def test_without_a_known_payload_no_gain_is_seen() -> None:
 def test_a_gain_whose_axis_never_moves_is_not_seen() -> None:
     truth = tx40_truth()
     design = _design(truth)
-    excitation = _excitation(np.random.default_rng(1), still=3)
+    rng = np.random.default_rng(1)
+    excitation = _excitation(rng, still=3)
     found = design.std_percent(design.information(excitation, (None, 0)))
     assert np.isinf(found[3])
-    judged = verdicts(design, [(excitation, (None, 0))]).gains
+    runs = [(excitation, (None, 0))]
+    judged = verdicts(design, runs).gains
     assert judged[3].verdict is Visibility.UNSEEN
     assert "not identifiable" in judged[3].words("J4")
 
@@ -230,21 +238,27 @@ def test_axis_1_upright_is_identifiable_only_through_inertia_and_on_a_wall_throu
     None
 ):
     truth = tx40_truth()
-    excitation = _excitation(np.random.default_rng(1))
-    upright = verdicts(_design(truth), [(excitation, (None, 0))]).gains[0]
+    rng = np.random.default_rng(1)
+    excitation = _excitation(rng)
+    gains = verdicts(_design(truth), [(excitation, (None, 0))]).gains
+    upright = gains[0]
     assert not upright.gravity_acts
     assert np.isinf(upright.alone_percent[GainSource.GRAVITY])
     assert "identifiable only through inertia" in upright.words("J1")
-    wall = verdicts(_design(truth, gravity=(9.81, 0.0, 0.0)), [(excitation, (None, 0))]).gains[0]
+    gravity = (9.81, 0.0, 0.0)
+    design = _design(truth, gravity=gravity)
+    runs = [(excitation, (None, 0))]
+    wall = verdicts(design, runs).gains[0]
     assert wall.gravity_acts
     assert np.isfinite(wall.alone_percent[GainSource.GRAVITY])
     assert "only through inertia" not in wall.words("J1")
 
 
 def test_no_source_alone_is_better_than_all_of_them() -> None:
-    for gain in verdicts(
-        _design(tx40_truth()), [(_excitation(np.random.default_rng(4)), (None, 0))]
-    ).gains:
+    design = _design(tx40_truth())
+    rng = np.random.default_rng(4)
+    runs = [(_excitation(rng), (None, 0))]
+    for gain in verdicts(design, runs).gains:
         assert all(
             alone >= gain.std_percent * (1.0 - 1e-9) for alone in gain.alone_percent.values()
         )
@@ -253,15 +267,17 @@ def test_no_source_alone_is_better_than_all_of_them() -> None:
 
 def test_the_advice_is_the_best_of_what_was_tried_and_says_what_it_gives() -> None:
     design = _design(tx40_truth())
-    weak = Design(
-        replace(design.expectation, noise_a=100.0 * design.expectation.noise_a), design.base
-    )
-    excitation = _excitation(np.random.default_rng(1), 100)
+    noise_a = 100.0 * design.expectation.noise_a
+    expectation = replace(design.expectation, noise_a=noise_a)
+    weak = Design(expectation, design.base)
+    rng = np.random.default_rng(1)
+    excitation = _excitation(rng, 100)
     extras = [
         ExtraMoves(f"{rows} rows", 5.0, _excitation(np.random.default_rng(rows), rows))
         for rows in (30, 300, 60)
     ]
-    judged = verdicts(weak, [(excitation, (None, 0))], extras).gains
+    runs = [(excitation, (None, 0))]
+    judged = verdicts(weak, runs, extras).gains
     for gain in judged:
         assert gain.advice is not None
         assert gain.advice.words == "300 rows"
@@ -275,9 +291,12 @@ def test_the_advice_is_the_best_of_what_was_tried_and_says_what_it_gives() -> No
 def test_two_mountings_have_unknowns_of_their_own() -> None:
     design = _design(tx40_truth())
     payload = design.expectation.payloads[0]
-    two = Design(replace(design.expectation, payloads=(payload, payload)), design.base)
-    assert two.others == design.others + 9
-    excitation = _excitation(np.random.default_rng(1))
+    expectation = replace(design.expectation, payloads=(payload, payload))
+    two = Design(expectation, design.base)
+    expected = design.others + 9
+    assert two.others == expected
+    rng = np.random.default_rng(1)
+    excitation = _excitation(rng)
     shared = design.std_percent(design.information(excitation, (None, 0, 0)))
     apart = two.std_percent(two.information(excitation, (None, 0, 1)))
     assert (apart >= shared * (1.0 - 1e-9)).all()
@@ -285,7 +304,9 @@ def test_two_mountings_have_unknowns_of_their_own() -> None:
 
 
 def test_base_parameters_of_the_geometry_do_not_depend_on_the_motion() -> None:
-    model = Model(robot_from_urdf(TX40.urdf), tx40_truth().model.drive_train)
+    robot = robot_from_urdf(TX40.urdf)
+    drive_train = tx40_truth().model.drive_train
+    model = Model(robot, drive_train)
     found = {
         visible_base(model, _motion(np.random.default_rng(seed), 700)).independent
         for seed in range(4)
@@ -301,11 +322,14 @@ def test_what_a_payload_adds_to_friction_is_seen_in_loaded_runs_alone(truth: Tru
         record(truth, f"run{number}", rng, payload, seconds=8.0)
         for number, payload in enumerate((None, MOUNTED))
     ]
-    base = identify(model, runs, CONDITIONING, judge=False).system.base
+    system = identify(model, runs, CONDITIONING, judge=False).system
+    base = system.base
     parameters = np.concatenate((truth.parameters, np.zeros(len(model.loaded_friction_columns))))
     noise = np.full(6, NOISE_A)
-    payload = ExpectedPayload(frozenset({"m"}), PAYLOAD)
-    design = Design(Expectation(model, truth.gains, parameters, (payload,), noise), base)
+    known = frozenset({"m"})
+    payload = ExpectedPayload(known, PAYLOAD)
+    expectation = Expectation(model, truth.gains, parameters, (payload,), noise)
+    design = Design(expectation, base)
     payload_friction = np.flatnonzero(np.isin(base.independent, model.loaded_friction_columns))
     assert len(payload_friction) == len(model.loaded_friction_columns)
     excitation = _excitation(rng)

@@ -30,9 +30,9 @@ lax: Any = ident  #: As a notebook sees it
 
 @pytest.fixture(scope="module")
 def model() -> ident.Model:
-    return ident.Model(
-        ident.robot_from_urdf(EXAMPLE.URDF), ident.DriveTrain(np.diag(EXAMPLE.GEAR_RATIOS))
-    )
+    robot = ident.robot_from_urdf(EXAMPLE.URDF)
+    gear_matrix = np.diag(EXAMPLE.GEAR_RATIOS)
+    return ident.Model(robot, ident.DriveTrain(gear_matrix))
 
 
 @pytest.fixture(scope="module")
@@ -47,8 +47,10 @@ def test_moves_keep_the_limits_and_begin_and_end_at_rest(plan: ident.PlannedMove
     lower, upper = LIMITS.targets()
     assert np.all(motion.position_rad >= lower - 1e-9)
     assert np.all(motion.position_rad <= upper + 1e-9)
-    speed = np.abs(motion.velocity_rad_s).max(axis=0) / LIMITS.velocity
-    acceleration = np.abs(motion.acceleration_rad_s2).max(axis=0) / LIMITS.acceleration
+    absolute_velocity_rad_s = np.abs(motion.velocity_rad_s)
+    speed = absolute_velocity_rad_s.max(axis=0) / LIMITS.velocity
+    absolute_acceleration_rad_s2 = np.abs(motion.acceleration_rad_s2)
+    acceleration = absolute_acceleration_rad_s2.max(axis=0) / LIMITS.acceleration
     assert np.all(np.maximum(speed, acceleration) <= 1.0 + 1e-9)
     assert max(speed.max(), acceleration.max()) > 0.9  # the fastest moves use a limit
     ends = np.cumsum(plan.move_s + plan.dwell_s)
@@ -63,9 +65,11 @@ def test_velocity_and_acceleration_are_derivatives_of_the_position(
     time_s, motion = plan.motion(5000.0)
     inner = slice(2, -2)
     velocity = np.gradient(motion.position_rad, time_s, axis=0)
-    assert np.abs(velocity - motion.velocity_rad_s)[inner].max() < 1e-3
+    velocity_difference = np.abs(velocity - motion.velocity_rad_s)
+    assert velocity_difference[inner].max() < 1e-3
     acceleration = np.gradient(motion.velocity_rad_s, time_s, axis=0)
-    assert np.abs(acceleration - motion.acceleration_rad_s2)[inner].max() < 0.05
+    acceleration_difference = np.abs(acceleration - motion.acceleration_rad_s2)
+    assert acceleration_difference[inner].max() < 0.05
 
 
 def _recorded(
@@ -116,10 +120,10 @@ def test_a_fit_of_planned_moves_has_smaller_deviations_than_of_random_ones(
             _recorded(model, moves, load, seed) for load, seed in ((None, 1), (EXAMPLE.DISC, 2))
         ]
         found = ident.identify(model, runs)
-        assert np.all(
-            np.abs(found.estimate.gains - EXAMPLE.TRUE_GAINS_NM_A) < 4.0 * found.estimate.gains_std
-        )
-        worst.append(float(np.max(found.estimate.gains_std / np.abs(found.estimate.gains))))
+        gain_difference = np.abs(found.estimate.gains - EXAMPLE.TRUE_GAINS_NM_A)
+        assert np.all(gain_difference < 4.0 * found.estimate.gains_std)
+        absolute_gain = np.abs(found.estimate.gains)
+        worst.append(float(np.max(found.estimate.gains_std / absolute_gain)))
     assert worst[0] < worst[1]
 
 
@@ -127,7 +131,8 @@ def _belted(payload: ident.Payload | None) -> tuple[ident.Model, FloatArray]:
     """The example's arm, whose forearm a belt turns with the second joint, and its parameters."""
     mimic = '<mimic joint="J2" multiplier="-0.8" offset="0.3"/></joint>'
     head, joint, tail = EXAMPLE.URDF.partition('<joint name="J3"')
-    urdf = head + joint + tail.replace("</joint>", mimic, 1)
+    changed_tail = tail.replace("</joint>", mimic, 1)
+    urdf = head + joint + changed_tail
     model = ident.Model(ident.robot_from_urdf(urdf), ident.DriveTrain(np.diag([100.0, 120.0])))
     parameters = _parameters(model, payload)
     follower = [14 * 2 + place for place in range(10, 14)]  # neither rotor nor friction of its own
@@ -144,20 +149,24 @@ def test_a_robot_with_a_joint_that_follows_an_axis_is_planned_for_with_what_it_c
     random = ident.plan_moves(model, limits, EXAMPLE.DISC, nameplate, exchanges=0)
     plan = ident.plan_moves(model, limits, EXAMPLE.DISC, nameplate, exchanges=200)
     assert plan.target_rad.shape[1] == 2
-    assert np.all(np.abs(plan.target_rad) <= limits.upper)
+    absolute_target_rad = np.abs(plan.target_rad)
+    assert np.all(absolute_target_rad <= limits.upper)
     assert plan.predicted_std_percent.max() < 0.9 * random.predicted_std_percent.max()
     runs: list[ident.Run] = []
     for payload, seed in ((None, 1), (EXAMPLE.DISC, 2)):
         time_s, motion = plan.motion(RATE_HZ)
         _, parameters = _belted(payload)
         torque_nm = np.einsum("jck,c->kj", model.regressor(motion), parameters)
-        noise_a = 0.05 * np.random.default_rng(seed).standard_normal(torque_nm.shape)
+        rng = np.random.default_rng(seed)
+        noise_a = 0.05 * rng.standard_normal(torque_nm.shape)
         name = "bare" if payload is None else "loaded"
         run = ident.Run(name, time_s, motion.position_rad, torque_nm / gains + noise_a, payload)
         runs.append(run)
     found = ident.identify(model, runs).estimate
-    assert np.all(np.abs(found.gains - gains) < 4.0 * found.gains_std)
-    found_percent = 100.0 * found.gains_std / np.abs(found.gains)
+    gain_difference = np.abs(found.gains - gains)
+    assert np.all(gain_difference < 4.0 * found.gains_std)
+    absolute_gain = np.abs(found.gains)
+    found_percent = 100.0 * found.gains_std / absolute_gain
     assert np.all(found_percent < plan.predicted_std_percent)
 
 

@@ -32,17 +32,22 @@ GOOD_VERDICT = GainVerdict(
 def test_after_the_time_left_every_gain_is_at_its_target(
     std: list[float], target: float, recorded_s: float
 ) -> None:
-    found = time_to_target(np.array(std), np.full(len(std), target), recorded_s)
+    target_percent = np.full(len(std), target)
+    std_percent = np.array(std)
+    found = time_to_target(std_percent, target_percent, recorded_s)
     # σ falls with the root of the time.
     then = np.array(std) * np.sqrt(recorded_s / (recorded_s + found.left_s))
     expected = np.minimum(std, target)
     assert then == pytest.approx(expected)
-    assert found.worst == int(np.argmax(std))
+    largest_std_index = int(np.argmax(std))
+    assert found.worst == largest_std_index
     assert found.is_reached == (found.longest_s == 0.0) == (max(std) <= target)
 
 
 def test_the_worst_gain_is_the_one_farthest_from_its_own_target() -> None:
-    found = time_to_target(np.array([1.0, 2.0, 0.2]), np.array([0.5, 2.0, np.inf]), 60.0)
+    target_percent = np.array([0.5, 2.0, np.inf])
+    std_percent = np.array([1.0, 2.0, 0.2])
+    found = time_to_target(std_percent, target_percent, 60.0)
     assert found.worst == 0
     assert found.ratio == pytest.approx([2.0, 1.0, 0.0])
     assert found.left_s == pytest.approx([180.0, 0.0, 0.0])
@@ -51,12 +56,14 @@ def test_the_worst_gain_is_the_one_farthest_from_its_own_target() -> None:
 
 def test_a_gain_that_is_not_known_takes_for_ever() -> None:
     for recorded_s in (0.0, 60.0):
-        found = time_to_target(np.array([0.1, np.inf]), np.array([0.5, 0.5]), recorded_s)
+        std_percent = np.array([0.1, np.inf])
+        found = time_to_target(std_percent, np.array([0.5, 0.5]), recorded_s)
         assert found.worst == 1
         assert found.left_s.tolist() == [0.0, np.inf]
         assert found.longest_s == np.inf
     # A gain that does not matter is not waited for.
-    assert time_to_target(np.array([0.1, np.inf]), np.array([0.5, np.inf]), 60.0).is_reached
+    target_percent = np.array([0.5, np.inf])
+    assert time_to_target(np.array([0.1, np.inf]), target_percent, 60.0).is_reached
 
 
 @pytest.mark.parametrize(
@@ -69,8 +76,10 @@ def test_a_gain_that_is_not_known_takes_for_ever() -> None:
     ],
 )
 def test_wrong_arguments_are_refused(std: list[float], target: list[float], message: str) -> None:
+    std_percent = np.array(std)
+    target_percent = np.array(target)
     with pytest.raises(ModelError, match=message):
-        time_to_target(np.array(std), np.array(target), 60.0)
+        time_to_target(std_percent, target_percent, 60.0)
 
 
 ALONE = {GainSource.GRAVITY: np.inf, GainSource.INERTIA: 20.0, GainSource.COUPLING: 1.0}
