@@ -76,7 +76,7 @@ def _offences(file: str, source: str) -> list[str]:
 
 
 def _sources() -> dict[str, str]:
-    paths = []
+    paths: list[Path] = []
     for package in PACKAGES:
         paths.extend((ROOT / package).rglob("*.py"))
     return {str(path.relative_to(ROOT)): path.read_text(encoding="utf-8") for path in paths}

@@ -113,7 +113,7 @@ def disagreements(profile: DriveProfile, sheet: ObjectDictionary) -> tuple[str, 
     if not lacks_deceleration:
         mapped.add(PROFILE_DECELERATION)
         read.append(PROFILE_DECELERATION)
-    faults = []
+    faults: list[str] = []
     for entry in dict.fromkeys(read):
         faults.extend(_faults(entry, sheet, mapped=entry in mapped))
     numbers = {}

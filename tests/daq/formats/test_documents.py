@@ -822,7 +822,7 @@ def test_the_name_gives_the_format(name: str, kind: ControllerFormat) -> None:
 
 def test_every_format_has_a_reader_and_suffixes_of_its_own() -> None:
     assert set(FORMATS) == set(ControllerFormat)
-    suffixes = []
+    suffixes: list[str] = []
     for _, of_format in FORMATS.values():
         suffixes.extend(of_format)
     assert len(suffixes) == len(set(suffixes))

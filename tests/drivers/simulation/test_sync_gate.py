@@ -48,7 +48,7 @@ def test_a_late_sync_moves_no_time_and_brings_its_bus_back() -> None:
 def test_every_round_of_syncs_is_one_cycle(buses: int, rounds: list[list[int]]) -> None:
     gate = SyncGate(buses)
     for order in rounds:
-        ran = []
+        ran: list[frozenset[int]] = []
         for bus in order:
             if bus < buses:
                 ran.extend(gate.arrive(bus))

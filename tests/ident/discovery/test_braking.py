@@ -15,6 +15,7 @@ from ident.data.dataset import Dataset
 from ident.discovery.braking import pushing
 from ident.discovery.evidence import Evidence, with_effects
 from ident.discovery.gates import Gates
+from ident.discovery.joining import SetAside
 from ident.discovery.loop import find_effects
 from ident.effects.effect import PlacedEffect
 from ident.effects.friction import AsymmetricViscous, NonlinearViscous, SpeedFriction, Stribeck
@@ -96,7 +97,7 @@ def test_the_search_writes_no_friction_that_drives_the_arm(clean: Evidence, trut
     steps = find_effects(worn, rng, GATES)
     end = steps[-1].after
     assert all(pushing(end, axis) == "" for axis in range(3))
-    aside = []
+    aside: list[SetAside] = []
     for step in steps:
         aside.extend(step.set_aside)
     assert any("would push the arm" in one.reason(NAMES) for one in aside)

@@ -274,7 +274,7 @@ def test_constrained_forward_dynamics_returns_the_acceleration(mechanism: Mechan
             tree.frames[tree.getFrameId(link, pin.FrameType.BODY)]
             for link in (closure.first, closure.second)
         ]
-        places = []
+        places: list[Any] = []
         for end in ends:
             places.extend((end.parentJoint, end.placement))
         rigid_constraint_model = pin.RigidConstraintModel(
