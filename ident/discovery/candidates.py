@@ -23,6 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ident.arrays import FloatArray, IntArray
+from ident.data.conditioning import as_recorded
 from ident.data.dataset import Dataset
 from ident.discovery.candidate_fits import (
     CandidateFit,
@@ -188,7 +189,12 @@ class SearchProblem:
         """
         if effect.abscissa in FAST:
             return self.torque(effect, axis)
-        columns = np.concatenate([columns_at(effect, run, axis) for run in self.rows], axis=-1)
+        conditioning = self.observation.conditioning
+        parts = [
+            as_recorded(run.rate_hz, conditioning, columns_at(effect, run, axis))
+            for run in self.rows
+        ]
+        columns = np.concatenate(parts, axis=-1)
         return at_joints(effect, axis, columns, self.model.drive_train)
 
 

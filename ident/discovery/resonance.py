@@ -33,7 +33,7 @@ from ident.effects.rotor import beside_rotor
 from ident.effects.signals import Signals, curvature
 from ident.effects.transmission import Backlash, Elasticity
 from ident.effects.twist import SETTLED_S, Gears, link_of, spring_torque, twists
-from ident.equations.rows import decimate_rows
+from ident.equations.rows import torques_at_rows
 
 Families = tuple[tuple[Effect, ...], ...]
 
@@ -249,7 +249,7 @@ def _tried(
     conditioning = search_problem.observation.conditioning
     runs = search_problem.runs
     rows = [
-        decimate_rows(data, conditioning, added(run))
+        torques_at_rows(data, conditioning, added(run))
         for run, data in zip(runs, search_problem.datasets, strict=True)
     ]
     columns = np.concatenate(rows, axis=-1)

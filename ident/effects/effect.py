@@ -21,7 +21,7 @@ from ident.arrays import FloatArray
 from ident.data.conditioning import Conditioning
 from ident.data.dataset import Dataset
 from ident.effects.signals import Abscissa, Signals
-from ident.equations.rows import decimate_rows
+from ident.equations.rows import torques_at_rows
 from ident.errors import EffectRefused
 from ident.model.model import Column, DriveTrain, Model
 from ident.model.robot import JointKind, Robot
@@ -470,7 +470,7 @@ def effect_columns(
     p, r).
     """
     parts = [
-        decimate_rows(data, conditioning, columns_at(effect, run, axis))
+        torques_at_rows(data, conditioning, columns_at(effect, run, axis))
         for run, data in zip(runs, datasets, strict=True)
     ]
     return np.concatenate(parts, axis=-1)

@@ -18,6 +18,7 @@ import numpy as np
 from daq.config.cell import model_of
 from ident.arrays import FloatArray
 from ident.data.run import Run
+from ident.discovery.current_filter import find_current_filter
 from ident.discovery.evidence import Evidence, gather, with_effects
 from ident.discovery.loop import Step, find_effects
 from ident.effects.effect import PlacedEffect
@@ -26,7 +27,15 @@ from ident.estimators.estimate import Estimate, RelativeError, of_squares
 from ident.estimators.identify import identify
 from ident.estimators.method import Method
 from tests.studies.real_runs import RECORDINGS, Recording, data_folder, stretches
-from tests.studies.regions import LEVEL, Rise, judge_rise, split_by_region, two_sides
+from tests.studies.regions import (
+    FIRST_BLOCK,
+    LEVEL,
+    Rise,
+    judge_rise,
+    rows_of_block,
+    split_by_region,
+    two_sides,
+)
 
 REGION = "region"  #: A split by region of the workspace
 TODAY = "today"  #: The one split that was made of each recording before
@@ -147,6 +156,12 @@ def judge_unit(unit: SplitUnit) -> tuple[JudgedEffect, ...]:
     found = identify(
         model_of(cell), rest, cell.conditioning, method=Method.ML, fixed_gains=recording.gains
     )
+    current_filter = find_current_filter(gather(found, rest))
+    if current_filter is not None:
+        conditioning = current_filter.applied_to(cell.conditioning)
+        found = identify(
+            model_of(cell), rest, conditioning, method=Method.ML, fixed_gains=recording.gains
+        )
     # The search is given no row of the part that judges it.
     steps = find_effects(gather(found, rest), np.random.default_rng(0))
     spent_s = time.process_time() - begun_s
@@ -199,10 +214,12 @@ def _judged(
         after.estimate.residual_torque(second) ** 2 - before.estimate.residual_torque(first) ** 2
     )
     change = np.where(first.use, change, 0.0)
-    rises = axis_rises(change, first)
+    rate_hz = recording_of(unit.recording).runs[0].rate_hz
+    first_block = rows_of_block(rate_hz, first.conditioning)
+    rises = axis_rises(change, first, first_block)
     worst = max(range(len(rises)), key=lambda axis: rises[axis].t - rises[axis].limit)
     used = first.use.any(axis=0)
-    total = judge_rise(change.sum(axis=0)[used], first.run[used])
+    total = judge_rise(change.sum(axis=0)[used], first.run[used], first_block=first_block)
     errors = of_squares(size, left_before), of_squares(size, left_after)
     points = np.subtract(errors[1].axes, errors[0].axes)
     return JudgedEffect(
@@ -230,10 +247,12 @@ def _judged(
     )
 
 
-def axis_rises(change: FloatArray, rows: Observation) -> tuple[Rise, ...]:
+def axis_rises(
+    change: FloatArray, rows: Observation, first_block: int = FIRST_BLOCK
+) -> tuple[Rise, ...]:
     """Judge the rise of each axis's squared error, shape (n, r);
     the level is shared by the axes.
     """
     level = LEVEL / len(change)
     pairs = zip(change, rows.use, strict=True)
-    return tuple(judge_rise(own[used], rows.run[used], level) for own, used in pairs)
+    return tuple(judge_rise(own[used], rows.run[used], level, first_block) for own, used in pairs)
