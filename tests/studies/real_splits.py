@@ -27,15 +27,7 @@ from ident.estimators.estimate import Estimate, RelativeError, of_squares
 from ident.estimators.identify import identify
 from ident.estimators.method import Method
 from tests.studies.real_runs import RECORDINGS, Recording, data_folder, stretches
-from tests.studies.regions import (
-    FIRST_BLOCK,
-    LEVEL,
-    Rise,
-    judge_rise,
-    rows_of_block,
-    split_by_region,
-    two_sides,
-)
+from tests.studies.regions import LEVEL, Rise, judge_rise, split_by_region, two_sides
 
 REGION = "region"  #: A split by region of the workspace
 TODAY = "today"  #: The one split that was made of each recording before
@@ -214,12 +206,10 @@ def _judged(
         after.estimate.residual_torque(second) ** 2 - before.estimate.residual_torque(first) ** 2
     )
     change = np.where(first.use, change, 0.0)
-    rate_hz = recording_of(unit.recording).runs[0].rate_hz
-    first_block = rows_of_block(rate_hz, first.conditioning)
-    rises = axis_rises(change, first, first_block)
+    rises = axis_rises(change, first)
     worst = max(range(len(rises)), key=lambda axis: rises[axis].t - rises[axis].limit)
     used = first.use.any(axis=0)
-    total = judge_rise(change.sum(axis=0)[used], first.run[used], first_block=first_block)
+    total = judge_rise(change.sum(axis=0)[used], first.run[used])
     errors = of_squares(size, left_before), of_squares(size, left_after)
     points = np.subtract(errors[1].axes, errors[0].axes)
     return JudgedEffect(
@@ -247,12 +237,10 @@ def _judged(
     )
 
 
-def axis_rises(
-    change: FloatArray, rows: Observation, first_block: int = FIRST_BLOCK
-) -> tuple[Rise, ...]:
+def axis_rises(change: FloatArray, rows: Observation) -> tuple[Rise, ...]:
     """Judge the rise of each axis's squared error, shape (n, r);
     the level is shared by the axes.
     """
     level = LEVEL / len(change)
     pairs = zip(change, rows.use, strict=True)
-    return tuple(judge_rise(own[used], rows.run[used], level, first_block) for own, used in pairs)
+    return tuple(judge_rise(own[used], rows.run[used], level) for own, used in pairs)

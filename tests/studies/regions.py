@@ -26,7 +26,7 @@ import numpy as np
 from scipy.special import stdtrit
 
 from ident.arrays import BoolArray, FloatArray, IntArray
-from ident.data.conditioning import Conditioning, rows_lost
+from ident.data.conditioning import Conditioning
 from ident.data.dataset import differentiate
 from ident.data.run import Run
 from ident.equations.rows import row_masks
@@ -178,17 +178,14 @@ def _side(run: Run, own: BoolArray) -> Run:
     )
 
 
-def independent_sums(
-    change: FloatArray, run: IntArray, first_block: int = FIRST_BLOCK
-) -> FloatArray:
+def independent_sums(change: FloatArray, run: IntArray) -> FloatArray:
     """Sums of a change over blocks of rows that are independent of each other, shape (blocks,).
 
     Args:
         change: of each row, in the order of time, shape (r,).
         run: of each row, shape (r,): no block has rows of two runs.
-        first_block: rows of a block at least.
     """
-    starts = _firsts(run, first_block)
+    starts = _firsts(run, FIRST_BLOCK)
     sums = np.add.reduceat(change, starts) if len(change) else change
     run = run[starts]
     while True:
@@ -210,24 +207,11 @@ def _firsts(run: IntArray, size: int) -> IntArray:
     return np.zeros(0, dtype=np.int64)
 
 
-def rows_of_block(rate_hz: float, conditioning: Conditioning) -> int:
-    """Rows of a block at least: those in half a window of the row filter, and in that of a low-pass
-    of the currents, which what the model lacks goes through, too.
-
-    Args:
-        rate_hz: sampling rate.
-        conditioning: the filters.
-    """
-    return FIRST_BLOCK + rows_lost(rate_hz, conditioning)
-
-
-def judge_rise(
-    change: FloatArray, run: IntArray, level: float = LEVEL, first_block: int = FIRST_BLOCK
-) -> Rise:
+def judge_rise(change: FloatArray, run: IntArray, level: float = LEVEL) -> Rise:
     """Judge the rise of a squared error by its change in each row, shape (r,), of runs,
     shape (r,).
     """
-    sums = independent_sums(change, run, first_block)
+    sums = independent_sums(change, run)
     blocks = len(sums)
     if blocks < 2:
         return Rise(float(sums.sum()), 0.0, blocks, float("inf"))
