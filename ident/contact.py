@@ -43,7 +43,7 @@ from scipy.special import gammaincinv
 
 from ident.arrays import BoolArray, FloatArray, IntArray, require_kind, require_number, takes
 from ident.calibration import Calibration
-from ident.data.conditioning import Conditioning
+from ident.data.conditioning import Conditioning, as_recorded
 from ident.data.dataset import differentiate
 from ident.data.run import Run
 from ident.equations.rows import row_filter, row_masks
@@ -239,7 +239,8 @@ def _residual(
         raise DataUnfit(
             data.name, "no row is left after the standstill and validity masks; did the robot move?"
         )
-    predicted = predict_torque(calibration, model, data).T
+    needed_nm = predict_torque(calibration, model, data).T
+    predicted = as_recorded(data.rate_hz, conditioning, needed_nm)
     measured = measured_torque(calibration, model, data.current_a, data.motion()).T
     torque_nm = filter_(measured - predicted)
     needed_nm = filter_(predicted)

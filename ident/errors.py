@@ -349,11 +349,11 @@ class Diagnosis:
     """Something wrong with a recording or fit that leaves usable numbers, and where to look."""
 
     #: One of axis-error, axis-idle, channels-exchanged, correction-unclear, current-clipped,
-    #: current-late, current-limited, current-off-scale, current-reversed, estimators-disagree,
-    #: gain-off-nameplate, gain-unseen, geometry-off, gravity-tilted, gravity-turned,
-    #: ill-conditioned, joint-still, length-off, masses-contradict, payload-differs, place-off,
-    #: position-late, position-reversed, readings-damaged, readings-frozen, readings-held,
-    #: time-skew, torque-above-limit, zero-off, zero-turned.
+    #: current-late, current-limited, current-off-scale, current-reversed, currents-filtered,
+    #: estimators-disagree, gain-off-nameplate, gain-unseen, geometry-off, gravity-tilted,
+    #: gravity-turned, ill-conditioned, joint-still, length-off, masses-contradict, payload-differs,
+    #: place-off, position-late, position-reversed, readings-damaged, readings-frozen,
+    #: readings-held, time-skew, torque-above-limit, zero-off, zero-turned.
     name: str
     runs: tuple[str, ...]  #: those it points at
     axes: tuple[str, ...]  #: likewise

@@ -16,7 +16,7 @@ import numpy as np
 
 from ident.arrays import BoolArray, FloatArray, IntArray
 from ident.calibration import Calibration
-from ident.data.conditioning import Conditioning
+from ident.data.conditioning import Conditioning, as_recorded
 from ident.data.dataset import Dataset
 from ident.effects.dictionary import GEOMETRY
 from ident.effects.effect import PlacedEffect, is_placeable
@@ -96,6 +96,7 @@ def geometry_drift(
     # Of a closed chain the signals have the joints without a motor, too, after those of the axes.
     velocity = signals.velocity_rad_s[: len(left_nm)]
     nuisance = _nuisance(signals.geared_torque_nm, velocity, payload_nm)
+    nuisance = as_recorded(slow.rate_hz, conditioning, nuisance)
     left = _beyond(nuisance, left_nm[:, None], weight)[:, 0]
     torque_nm = model.drive_train.direction.T @ signals.motor_torque_nm
     usual_nm = _usual_error_nm(calibration, torque_nm, use)
@@ -110,7 +111,8 @@ def geometry_drift(
             least = 0.0
         elif not excess > 0.0:
             continue  # the run is predicted as well as what was fitted
-        columns_nm = placed.effect.columns(signals, placed.axis)
+        change_nm = placed.effect.columns(signals, placed.axis)
+        columns_nm = as_recorded(slow.rate_hz, conditioning, change_nm)
         columns = _beyond(nuisance, columns_nm, weight)
         found = _fitted(placed, columns, left, move, excess, least)
         if found is None:

@@ -65,6 +65,8 @@ _Positive = Annotated[float, Field(ge=0.0, le=_LARGEST)]
 _FILTER_BOUNDS = {
     **dict.fromkeys(("position_cutoff_hz", "decimation_cutoff_hz"), CUTOFF_HZ),
     "position_order": FILTER_ORDER,
+    "current_cutoff_hz": CUTOFF_HZ,
+    "current_order": (0, FILTER_ORDER[1]),
     "standstill_rad_s": (0.0, 1e6),
     "standstill_share": (1e-6, 1.0),
 }

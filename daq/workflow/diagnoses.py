@@ -47,6 +47,7 @@ from daq.workflow.geometry_diagnoses import geometry_diagnoses
 from daq.workflow.zero_text import DEGREES, MILLIMETRES, zero_off_text, zero_remedy
 from ident.arrays import FloatArray
 from ident.data.run import Run
+from ident.discovery.current_filter import CurrentFilter
 from ident.discovery.effect_verdict import Judgement
 from ident.discovery.evidence import Evidence, coefficients_of
 from ident.discovery.geometry_check import GeometryCheck, check_geometry
@@ -159,6 +160,23 @@ def diagnose_fit(
     if suspect or found.estimate.gains_fixed:
         require_right_currents(recordings, each=suspect)
     return (*geometry_diagnoses(geometry, cell, applied=corrected), *diagnoses)
+
+
+def current_filter_diagnoses(found: CurrentFilter | None) -> tuple[Diagnosis, ...]:
+    """Name a low-pass that the currents went through before they were recorded; empty without."""
+    if found is None:
+        return ()
+    diagnosis = Diagnosis(
+        name="currents-filtered",
+        runs=(),
+        axes=(),
+        found=f"currents that went through {found.describe()}, and positions that did not",
+        expected="currents as the drives report them",
+        remedy="the torques of the model went through the same filter, so that gains and effects "
+        "are those of the arm; record unfiltered currents: friction where a joint turns back, and "
+        "whatever else is fast, can hardly be seen in these",
+    )
+    return (diagnosis,)
 
 
 def nameplate_of(cell: Cell) -> FloatArray:

@@ -44,6 +44,7 @@ from daq.workflow.diagnoses import (
     by_likelihood,
     check_diagnoses,
     correction_diagnoses,
+    current_filter_diagnoses,
     diagnose_fit,
     fixed_gains_of,
     geometry_beside,
@@ -62,6 +63,7 @@ from ident.data.run import Run
 from ident.data.torque_channel import TorqueChannel, TorqueSlope, torque_slope
 from ident.discovery.acceptance import accept_on_holdout, compare_on_holdout
 from ident.discovery.before_after import error_on
+from ident.discovery.current_filter import CurrentFilter, find_current_filter
 from ident.discovery.declared import impossible_declared, with_declared
 from ident.discovery.evidence import Evidence, gather, with_effects, without_effects
 from ident.discovery.geometry_check import GeometryCheck
@@ -128,6 +130,9 @@ class Fit:
     geometry_covariance: FloatArray | None = None
     #: of the fit before a search; empty where none was made
     diagnoses_before: tuple[Diagnosis, ...] = ()
+    #: Low-pass that the currents went through before they were recorded, as the data show it; the
+    #: fit is one with it. None where they show none, or where it was not looked for.
+    current_filter: CurrentFilter | None = None
     #: Verdicts on the gains that are not known well enough; empty where all are, and before they
     #: are made.
     uncertain: tuple[GainVerdict, ...] = ()
@@ -398,9 +403,17 @@ def fit(
     recorded = [Path(log) for log in logs]
     held_out = [Path(log) for log in holdout]
 
-    def attempt(used: Sequence[Path], unseen: Sequence[Path], method: Method) -> Fit:
+    def attempt(
+        used: Sequence[Path],
+        unseen: Sequence[Path],
+        method: Method,
+        current_filter: CurrentFilter | None = None,
+    ) -> Fit:
         reading = LogLoader.of(used, cell, lossy)
         declared = reading.cell
+        if current_filter is not None:
+            conditioning = current_filter.applied_to(declared.conditioning)
+            declared = replace(declared, conditioning=conditioning)
         effects = declared_effects(declared)
         if method is Method.IV:
             refuse_effects(declared, "--method iv")
@@ -419,6 +432,10 @@ def fit(
             axes=declared.axis_names,
         )
         steps = with_effects_of_cell(result, effects, declared.place_names)
+        if result.gathered is not None and current_filter is None:
+            found = find_current_filter(steps[-1].after if steps else gather(result))
+            if found is not None:
+                return attempt(used, unseen, method, found)
         last = steps[-1].after.identification if steps else result
         paper = None if gains_fixed else tls(last.system)
         return Fit(
@@ -434,6 +451,7 @@ def fit(
             torque_slopes=reading.torque_slopes(),
             channels_as_wired=channels_as_wired,
             geometry=reading.geometry(model),
+            current_filter=current_filter,
         )
 
     chosen = method or (Method.WLS if gains_fixed else Method.ML)
@@ -498,7 +516,8 @@ def _with_diagnoses(fitted: Fit) -> Fit:
         fitted.geometry,
         corrected=fitted.is_corrected,
     )
-    return replace(fitted, diagnoses=(*of_description, *of_fit), is_holdout_judged=False)
+    named = (*of_description, *current_filter_diagnoses(fitted.current_filter), *of_fit)
+    return replace(fitted, diagnoses=named, is_holdout_judged=False)
 
 
 def _turned_geometry_of(fitted: Fit) -> Diagnosis | None:

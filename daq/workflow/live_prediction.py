@@ -36,7 +36,7 @@ from daq.workflow.validate import (
 )
 from ident.arrays import FloatArray, IntArray
 from ident.calibration import Calibration
-from ident.data.conditioning import central_differences, decimator, low_pass
+from ident.data.conditioning import central_differences, current_rows, low_pass, torque_rows
 from ident.data.dataset import moving_samples, planned
 from ident.equations.rows import row_masks
 from ident.errors import IdentificationError
@@ -148,7 +148,8 @@ class Predictor:
         self._calibration, self._model = on_cell(calibration, cell)
         self._conditioning = conditioning_of(calibration)
         self._rate_hz = rate_hz
-        self._filter = decimator(rate_hz, self._conditioning.decimation_cutoff_hz)
+        self._filter = current_rows(rate_hz, self._conditioning)
+        self._torque_filter = torque_rows(rate_hz, self._conditioning)
         edge = round(EDGE_S * rate_hz)
         self.rows_hz = rate_hz / self._filter.factor
         self._step = max(1, round(STEP_S * rate_hz))
@@ -223,7 +224,7 @@ class Predictor:
         current = self._current[1:-1]
         predicted_a = predict_current(self._calibration, self._model, data)
         measured_a = measured_current(self._calibration, self._model, current, motion)
-        predicted = self._filter(predicted_a.T)
+        predicted = self._torque_filter(predicted_a.T)
         measured = self._filter(measured_a.T)
         count = position.shape[1]
         centres = self._filter.centres(count)

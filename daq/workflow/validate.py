@@ -47,7 +47,7 @@ from ident.effects.geometry_corrections import (
 from ident.effects.signals import REFERENCE_C
 from ident.equations.instants import read_instants
 from ident.equations.reduction import reduce_runs, regrouped
-from ident.equations.rows import row_filter, row_masks
+from ident.equations.rows import row_filter, row_masks, torques_at_rows
 from ident.equations.system import System
 from ident.errors import DataUnfit, Diagnosis, IdentificationError, ModelError
 from ident.estimators.diagnosis import axis_error_diagnoses, exchanged_channels, scale_diagnoses
@@ -256,7 +256,7 @@ def predicted(calibration: Calibration, described: Cell, log: Path, run: Run) ->
         partial=run.partial,
         time_s=data.time_s[centres] - data.time_s[0],
         measured_nm=filter_(torque_nm.T),
-        predicted_nm=filter_(predicted_nm.T),
+        predicted_nm=torques_at_rows(data, conditioning, predicted_nm.T),
         use=use,
     )
 

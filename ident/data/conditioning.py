@@ -28,6 +28,15 @@ FULL_FILTER_HZ = 125.0
 below, they fall with it.
 """
 
+#: Settings that a document has where the currents went through a low-pass
+CURRENT_FILTER = ("current_cutoff_hz", "current_order")
+#: Settings that are no number, or that a document may leave out
+NOT_NEEDED = frozenset({"standstill_rad_s", *CURRENT_FILTER})
+
+#: Share of the response of the currents' low-pass that is beyond its window
+FORGOTTEN = 0.01
+RESPONSE_PERIODS = 3.0  #: Periods of its cut-off after which less than that is left
+
 
 @dataclass(frozen=True, slots=True)
 class Conditioning:
@@ -43,6 +52,12 @@ class Conditioning:
     standstill_rad_s: tuple[float, ...] = ()
     #: a row is left out when standstill fills more than this share of its filter window
     standstill_share: float = 0.1
+    #: Cut-off of a low-pass that the currents went through before they were recorded; every torque
+    #: that is compared with them goes through it. 0 for currents as they flowed.
+    current_cutoff_hz: float = 0.0
+    #: Order of that low-pass, a Butterworth forwards and backwards, −6 dB at the cut-off: what was
+    #: made smooth after the recording. 0 for a causal one of first order, as drives have it.
+    current_order: int = 0
 
     @classmethod
     def for_rates(cls, rates_hz: Iterable[float]) -> Self:
@@ -65,24 +80,33 @@ class Conditioning:
         Raises:
             ModelError: a setting is missing, unknown, or no number.
         """
-        expected = cls().document()
+        expected = asdict(cls())
         found: dict[str, Any] = dict(document)
+        for name in CURRENT_FILTER:
+            found.setdefault(name, 0)
         lists = [name for name, value in found.items() if isinstance(value, list)]
         if found.keys() != expected.keys() or lists != ["standstill_rad_s"]:
             given = ", ".join(f"{name}: {value}" for name, value in found.items()) or "nothing"
-            numbers = ", ".join(sorted(expected.keys() - {"standstill_rad_s"}))
+            numbers = ", ".join(sorted(expected.keys() - NOT_NEEDED))
             raise ModelError(
                 f"the filter of the calibration: found {given}; expected a list standstill_rad_s "
                 f"and numbers {numbers}; give `conditioning`, or fit again"
             )
         order = round(found.pop("position_order"))
+        current_order = round(found.pop("current_order"))
         speeds = tuple(found.pop("standstill_rad_s"))
-        return cls(**found, position_order=order, standstill_rad_s=speeds)
+        return cls(
+            **found, position_order=order, current_order=current_order, standstill_rad_s=speeds
+        )
 
     def document(self) -> dict[str, float | list[float]]:
         """Settings by name, for a report."""
         document = asdict(self)
         document["standstill_rad_s"] = list(self.standstill_rad_s)
+        if not self.current_cutoff_hz:
+            # Calibrations of currents as they flowed stay as they were before it was known.
+            for name in CURRENT_FILTER:
+                del document[name]
         return document
 
 
@@ -307,3 +331,112 @@ def decimator(rate_hz: float, cutoff_hz: float) -> Decimator:
     response = np.sinc(2.0 * cutoff_hz / rate_hz * samples)
     taps = response * np.hamming(2 * half + 1)
     return Decimator(taps / taps.sum(), factor)
+
+
+def current_rows(rate_hz: float, conditioning: Conditioning) -> Decimator:
+    """Decimator of the currents, and of whatever else is wanted at the rows.
+
+    Its windows are as long as those of `torque_rows`, so both have the same rows.
+    """
+    plain = decimator(rate_hz, conditioning.decimation_cutoff_hz)
+    if not conditioning.current_cutoff_hz:
+        return plain
+    longer = rows_lost(rate_hz, conditioning) * plain.factor
+    return Decimator(np.pad(plain.taps, longer), plain.factor)
+
+
+def torque_rows(rate_hz: float, conditioning: Conditioning) -> Decimator:
+    """Decimator of the torques that are compared with the currents:
+    through the low-pass of the currents, too.
+
+    Without such a low-pass it is that of the currents.
+    """
+    plain = decimator(rate_hz, conditioning.decimation_cutoff_hz)
+    if not conditioning.current_cutoff_hz:
+        return plain
+    response = _current_response(rate_hz, conditioning)
+    # A tap weights the sample at its place in the window: the past comes first.
+    taps = np.convolve(plain.taps, response[::-1])
+    longer = rows_lost(rate_hz, conditioning) * plain.factor - len(response) // 2
+    return Decimator(np.pad(taps, longer), plain.factor)
+
+
+def rows_lost(rate_hz: float, conditioning: Conditioning) -> int:
+    """Rows at either end of a run whose window is not in it for the low-pass of the currents.
+
+    The others are the rows that the run has without it.
+    """
+    plain = decimator(rate_hz, conditioning.decimation_cutoff_hz)
+    return ceil(memory_samples(rate_hz, conditioning) / plain.factor)
+
+
+def memory_samples(rate_hz: float, conditioning: Conditioning) -> int:
+    """Samples on either side of one, at some rate, that the low-pass of the currents mixes in."""
+    if not conditioning.current_cutoff_hz:
+        return 0
+    return len(_current_response(rate_hz, conditioning)) // 2
+
+
+def as_recorded(rate_hz: float, conditioning: Conditioning, columns: FloatArray) -> FloatArray:
+    """Columns of torque as the recorded currents show them, shape (..., k):
+    through the low-pass of the currents where they went through one, and at the same rate.
+
+    Outside of them they are as in their first and last entry.
+
+    Args:
+        rate_hz: of the series; that of the rows where the columns were made of decimated motion.
+        conditioning: the filters.
+        columns: of a run from its beginning to its end.
+    """
+    if not conditioning.current_cutoff_hz:
+        return columns
+    response = _current_response(rate_hz, conditioning)
+    memory = len(response) // 2
+    around = [(0, 0)] * (columns.ndim - 1) + [(memory, memory)]
+    padded = np.pad(columns, around, mode="edge")
+    windows = np.lib.stride_tricks.sliding_window_view(padded, len(response), axis=-1)
+    return np.asarray(windows @ response[::-1])
+
+
+def _current_response(rate_hz: float, conditioning: Conditioning) -> FloatArray:
+    """Response of the currents' low-pass to a unit sample, shape (2 l + 1,), with the sum one."""
+    return _response(rate_hz, conditioning.current_cutoff_hz, conditioning.current_order)
+
+
+@lru_cache(maxsize=256)
+def _response(rate_hz: float, cutoff_hz: float, order: int) -> FloatArray:
+    if order:
+        found = _zero_phase_response(rate_hz, cutoff_hz, order)
+    else:
+        found = _lag_response(rate_hz, cutoff_hz)
+    middle = len(found) // 2
+    size = np.abs(found)
+    # What both ends together hold, by how many samples are left around the middle
+    inside = size[middle] + np.cumsum(size[middle + 1 :] + size[:middle][::-1])
+    length = 1 + int(np.searchsorted(inside, (1.0 - FORGOTTEN) * inside[-1]))
+    response = found[middle - length : middle + length + 1]
+    return np.asarray(response / response.sum())
+
+
+def _zero_phase_response(rate_hz: float, cutoff_hz: float, order: int) -> FloatArray:
+    """Of a Butterworth low-pass forwards and backwards."""
+    length = ceil(RESPONSE_PERIODS * rate_hz / cutoff_hz)
+    impulse = np.zeros((1, 2 * length + 1))
+    impulse[0, length] = 1.0
+    return np.asarray(low_pass(impulse, rate_hz, cutoff_hz, order)[0])
+
+
+def _lag_response(rate_hz: float, cutoff_hz: float) -> FloatArray:
+    """Of a low-pass of first order, as a drive has it.
+
+    T ẏ + y = x with T = 1/(2π cut-off) is solved exactly for an x that is straight between
+    samples: y_k = a y_k−1 + b_0 x_k + b_1 x_k−1 with w = 1/(rate T), a = e^−w,
+    b_0 = 1 − (1 − a)/w and b_1 = (1 − a)/w − a.
+    """
+    w = 2.0 * np.pi * cutoff_hz / rate_hz
+    decay = float(np.exp(-w))
+    mean = (1.0 - decay) / w
+    length = ceil(RESPONSE_PERIODS * rate_hz / cutoff_hz)
+    newest = 1.0 - mean
+    after = (newest * decay + mean - decay) * decay ** np.arange(length)
+    return np.concatenate((np.zeros(length), [newest], after))

@@ -450,6 +450,8 @@ def _check(run: Run, count: int, conditioning: Conditioning, refuse: Refusal) ->
         "position": conditioning.position_cutoff_hz,
         "decimation": conditioning.decimation_cutoff_hz,
     }
+    if conditioning.current_cutoff_hz:
+        cutoffs_hz["current"] = conditioning.current_cutoff_hz
     lowest = min(cutoffs_hz.values())
     if not lowest > 0.0:
         raise refuse(

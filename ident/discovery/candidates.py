@@ -23,7 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ident.arrays import FloatArray, IntArray
-from ident.data.conditioning import Conditioning
+from ident.data.conditioning import Conditioning, as_recorded
 from ident.data.dataset import Dataset
 from ident.discovery.candidate_fits import (
     CandidateFit,
@@ -194,7 +194,11 @@ class SearchProblem:
         """Build the same from signals at the rows: fast, good for effects that change slowly."""
         if effect.abscissa in FAST:
             return self.torque(effect, axis)
-        of_runs = [columns_at(effect, run, axis) for run in self.rows]
+        conditioning = self.observation.conditioning
+        of_runs: list[FloatArray] = []
+        for run in self.rows:
+            columns = columns_at(effect, run, axis)
+            of_runs.append(as_recorded(run.rate_hz, conditioning, columns))
         columns = np.concatenate(of_runs, axis=-1)
         return at_joints(effect, axis, columns, self.model.drive_train)
 

@@ -20,7 +20,7 @@ from ident.discovery.gates import certain_delays
 from ident.effects.effect import PlacedEffect, at_joints
 from ident.effects.electrical import Lag, TimeSkew
 from ident.effects.signals import fitted_signals, session_began_s
-from ident.equations.rows import decimate_rows
+from ident.equations.rows import torques_at_rows
 
 Delay = Lag | TimeSkew
 
@@ -70,7 +70,7 @@ def torque_rates(evidence: Evidence) -> FloatArray:
             evidence.model, data, evidence.training, evidence.estimate, began_s, inertia=False
         )
         rate = -TimeSkew().columns(signals, 0)[:, 0]
-        parts.append(decimate_rows(data, evidence.conditioning, rate))
+        parts.append(torques_at_rows(data, evidence.conditioning, rate))
     return np.concatenate(parts, axis=-1)
 
 

@@ -32,7 +32,7 @@ from ident.effects.rotor import beside_rotor
 from ident.effects.signals import Signals, curvature
 from ident.effects.transmission import Backlash, Elasticity
 from ident.effects.twist import SETTLED_S, Gears, link_of, spring_torque, twists
-from ident.equations.rows import decimate_rows
+from ident.equations.rows import torques_at_rows
 
 Families = tuple[tuple[Effect, ...], ...]
 
@@ -261,7 +261,7 @@ def _tried(
     conditioning = search_problem.observation.conditioning
     rows: list[FloatArray] = []
     for run, data in zip(search_problem.runs, search_problem.datasets, strict=True):
-        rows.append(decimate_rows(data, conditioning, added(run)))
+        rows.append(torques_at_rows(data, conditioning, added(run)))
     columns = np.concatenate(rows, axis=-1)
     torque = np.zeros((search_problem.axes, *columns.shape))
     torque[axis] = columns

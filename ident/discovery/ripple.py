@@ -30,13 +30,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from ident.arrays import FloatArray
+from ident.data.conditioning import torque_rows
 from ident.discovery.candidates import SearchProblem
 from ident.discovery.gates import Gates
 from ident.discovery.structure import MIN_MOVES_FOR_STRUCTURE
 from ident.effects.effect import Effect, PlacedEffect
 from ident.effects.electrical import Cogging
 from ident.effects.transmission import Ripple
-from ident.equations.rows import row_filter
 
 LARGEST_ORDER = {0: 12.5, 1: 200.0}  #: Per revolution of the motor (0) and of the joint (1)
 FEWEST_PERIODS = 4.0  #: Over the range of the angle
@@ -166,7 +166,9 @@ def periodogram(search_problem: SearchProblem, axis: int, of_joint: int) -> Peri
     # A whitened line is T_D times its torque at the axes. T_D = P D⁻¹ and P e = e: T_Dᵀe = D⁻¹e,
     # also with preload.
     weights = torque * problem.gamma / problem.noise
-    filters = [row_filter(data, observation.conditioning) for data in search_problem.datasets]
+    filters = [
+        torque_rows(data.rate_hz, observation.conditioning) for data in search_problem.datasets
+    ]
     # A line is decorrelated as the residual was: (V^(−1/2)Φ)ᵀe = Φᵀ(V^(−1/2)e).
     residual = problem.decorrelated(problem.residual)
     starts = np.searchsorted(observation.run, np.arange(len(angles)))

@@ -21,7 +21,7 @@ from ident.arrays import FloatArray
 from ident.data.conditioning import Conditioning
 from ident.data.dataset import Dataset
 from ident.effects.signals import Abscissa, Signals
-from ident.equations.rows import decimate_rows
+from ident.equations.rows import torques_at_rows
 from ident.errors import EffectRefused
 from ident.model.model import Column, DriveTrain, Model
 from ident.model.robot import JointKind, Robot
@@ -450,7 +450,7 @@ def effect_columns(
     parts: list[FloatArray] = []
     for run, data in zip(runs, datasets, strict=True):
         columns = columns_at(effect, run, axis)
-        parts.append(decimate_rows(data, conditioning, columns))
+        parts.append(torques_at_rows(data, conditioning, columns))
     return np.concatenate(parts, axis=-1)
 
 

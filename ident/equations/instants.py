@@ -14,7 +14,7 @@ from math import ceil
 import numpy as np
 
 from ident.arrays import BoolArray, FloatArray, IntArray
-from ident.data.conditioning import Conditioning, Decimator, decimator
+from ident.data.conditioning import Conditioning, Decimator, current_rows
 from ident.data.dataset import Dataset, differentiate
 from ident.data.run import Run
 from ident.equations.rows import row_masks
@@ -62,7 +62,7 @@ def instants_of(model: Model, data: Dataset, conditioning: Conditioning) -> Inst
         data: a differentiated run.
         conditioning: the filters.
     """
-    filter_ = decimator(data.rate_hz, conditioning.decimation_cutoff_hz)
+    filter_ = current_rows(data.rate_hz, conditioning)
     samples = len(data.time_s)
     count = filter_.rows(samples)
     if count < 1:

@@ -12,10 +12,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ident.arrays import BoolArray, FloatArray, IntArray
-from ident.data.conditioning import Conditioning
+from ident.data.conditioning import Conditioning, as_recorded
 from ident.data.dataset import Dataset
 from ident.equations.reduction import ReadRun, payload_values, reduce_rows
-from ident.equations.rows import Rows, demanded_at_rows, motor_columns, row_filter, rows_of
+from ident.equations.rows import (
+    Rows,
+    demanded_at_rows,
+    motor_columns,
+    row_filter,
+    rows_of,
+)
 from ident.equations.system import Equations, System
 from ident.model.model import Column, Model
 
@@ -296,7 +302,9 @@ def on_demanded_motion(model: Model, datasets: Sequence[Dataset], rows: Observat
             of_run = rows.run == index
             filter_ = row_filter(data, rows.conditioning)
             demanded = demanded_at_rows(data.demanded, filter_)
-            standard = model.regressor(demanded, loaded=data.payload is not None)
+            at_rows = model.regressor(demanded, loaded=data.payload is not None)
+            rate_hz = data.rate_hz / filter_.factor
+            standard = as_recorded(rate_hz, rows.conditioning, at_rows)
             regressor[:, :, of_run] = standard[:, base]
             flange[:, :, of_run] = standard[:, model.flange]
     return replace(rows, regressor=regressor, flange=flange)

@@ -11,25 +11,33 @@ from math import ceil
 import numpy as np
 
 from ident.arrays import BoolArray, FloatArray, IntArray
-from ident.data.conditioning import Conditioning, Decimator, decimator
+from ident.data.conditioning import (
+    Conditioning,
+    Decimator,
+    as_recorded,
+    current_rows,
+    memory_samples,
+    torque_rows,
+)
 from ident.data.dataset import Dataset
-from ident.errors import DataUnfit
+from ident.errors import DataUnfit, ModelError
 from ident.model.model import Model, preload_directions, spread
 from ident.model.robot import Motion
 
 #: Decimated rows built at once: the regressor of their samples stays in the cache's reach
 CHUNK_ROWS = 256
+SHORTEST_REST_S = 0.2  #: A standstill that is shorter is one of a joint that turns back
 FEWEST_ROWS = 10  #: Rows of the shortest run
 
 
 def row_filter(data: Dataset, conditioning: Conditioning) -> Decimator:
-    """The parallel decimation of a run's columns to rows.
+    """The parallel decimation of a run's currents to rows; `torque_rows` is that of torques.
 
     Raises:
         DataUnfit: the run is too short for it.
     """
     cutoff_hz = conditioning.decimation_cutoff_hz
-    filter_ = decimator(data.rate_hz, cutoff_hz)
+    filter_ = current_rows(data.rate_hz, conditioning)
     samples = len(data.time_s)
     if filter_.rows(samples) < FEWEST_ROWS:
         duration_s = samples / data.rate_hz
@@ -43,7 +51,15 @@ def decimate_rows(data: Dataset, conditioning: Conditioning, columns: FloatArray
     """Parallel decimation of full-rate columns of a run to the observation's rows:
     shape (..., k) → (..., r).
     """
-    filter_ = decimator(data.rate_hz, conditioning.decimation_cutoff_hz)
+    filter_ = current_rows(data.rate_hz, conditioning)
+    return filter_(columns)
+
+
+def torques_at_rows(data: Dataset, conditioning: Conditioning, columns: FloatArray) -> FloatArray:
+    """Decimate columns of torque as the equations do, shape (..., k) → (..., r):
+    through the low-pass of the currents, too, where they went through one.
+    """
+    filter_ = torque_rows(data.rate_hz, conditioning)
     return filter_(columns)
 
 
@@ -76,19 +92,28 @@ def row_masks(
     """Rows of each axis, and of each motor, that count (Observation.use, .motor_use),
     both of shape (m, r).
 
+    Where the currents went through a low-pass, a row has torques of samples around its own window,
+    too. At most `standstill_share` of it may be those of a rest, in which dry friction may be any.
+    A joint that turns back rests for a moment only, and its friction turns with it. Samples that
+    are not valid do no harm there: their positions are known.
+
     Preload joins the equations of all motors: of a redundant drive, rows count in which all of them
     move.
     """
     drive_train = model.drive_train
-    filter_ = decimator(data.rate_hz, conditioning.decimation_cutoff_hz)
     # A row's share of standstill is weighted as the filter weights its samples.
-    weights = np.abs(filter_.taps)
-    window = Decimator(weights / weights.sum(), filter_.factor)
+    window = _shares(current_rows(data.rate_hz, conditioning))
     largest_share = conditioning.standstill_share
     still_share = _share_without(data.moving, window)
     invalid_share = _share_without(data.valid, window)
     use = (still_share <= largest_share) & (invalid_share == 0.0)
     motor_still = _share_without(data.motor_moving, window) > largest_share
+    if conditioning.current_cutoff_hz:
+        memory = _shares(torque_rows(data.rate_hz, conditioning))
+        shortest = round(SHORTEST_REST_S * data.rate_hz)
+        use &= _share_without(~_rests(~data.moving, shortest), memory) <= largest_share
+        motor_rests = _rests(~data.motor_moving, shortest)
+        motor_still |= _share_without(~motor_rests, memory) > largest_share
     # Motor i's equation mixes the joints in row i of T (DriveTrain.to_motor); each of them must
     # count.
     is_mixed = np.abs(drive_train.to_motor) > 0
@@ -107,6 +132,22 @@ def row_masks(
         use[:] = all_move
         motor_use[:] = all_move
     return use, motor_use
+
+
+def _rests(still: BoolArray, shortest: int) -> BoolArray:
+    """Samples of each column that are still for so many samples at least, shape (k, m)."""
+    found = np.zeros_like(still)
+    for own, column in zip(found.T, still.T, strict=True):
+        edges = np.flatnonzero(np.diff(column.astype(np.int8), prepend=0, append=0))
+        for begin, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+            own[begin:end] = end - begin >= shortest
+    return found
+
+
+def _shares(filter_: Decimator) -> Decimator:
+    """Weight of each sample in a filter's window, as a share of all."""
+    weights = np.abs(filter_.taps)
+    return Decimator(weights / weights.sum(), filter_.factor)
 
 
 def _share_without(flags: BoolArray, window: Decimator) -> FloatArray:
@@ -165,7 +206,14 @@ def rows_of(
 
     Raises:
         DataUnfit: the run is too short for the filter, or no row of it counts.
+        ModelError: the currents of a redundant drive went through a low-pass.
     """
+    if model.is_redundant and conditioning.current_cutoff_hz:
+        raise ModelError(
+            f"found current_cutoff_hz = {conditioning.current_cutoff_hz:g} for a robot with more "
+            "motors than degrees of freedom; expected 0: how the motors share a torque changes "
+            "while they move, and a low-pass of their currents is not modelled; leave it out"
+        )
     filter_ = row_filter(data, conditioning)
     use, motor_use = row_masks(model, data, conditioning)
     if not use.any():
@@ -179,20 +227,20 @@ def rows_of(
     demanded = None
     if data.demanded is not None:
         demanded = demanded_at_rows(data.demanded, filter_)
-    loaded = data.payload is not None
+    of_torque = torque_rows(data.rate_hz, conditioning)
     first = 0
     for part in chunks(filter_, samples, chunk_rows):
         if model.is_redundant:
             standard, drive, preload = _balanced(model, data, part, filter_)
         else:
-            standard = _filtered_regressor(model, data, part, filter_)
+            standard = _filtered_regressor(model, data, part, of_torque)
             drive = np.empty((len(standard), 0, standard.shape[2]))
             preload = drive
         piece = slice(first, first + standard.shape[2])
         first = piece.stop
         instrument = standard
         if demanded is not None:
-            instrument = model.regressor(_part(demanded, piece), loaded=loaded)
+            instrument = _instruments(model, data, demanded, piece, conditioning)
         yield Rows(
             current=filter_(data.current_a[part].T),
             standard=standard,
@@ -228,8 +276,7 @@ def _balanced(
     sample; then, with an A that went through the same filter, they are written as torques of the
     axes.
     """
-    loaded = data.payload is not None
-    columns, to_motors = model.balance(data.motion(part), loaded=loaded)
+    columns, to_motors = model.balance(data.motion(part), loaded=data.payload is not None)
     currents = data.current_a[part].T
     filtered_to_motors = filter_(to_motors)
     standard = spread(filter_(columns), filtered_to_motors)
@@ -248,6 +295,27 @@ def demanded_at_rows(demanded: Motion, filter_: Decimator) -> Motion:
         velocity_rad_s=filter_(demanded.velocity_rad_s.T).T,
         acceleration_rad_s2=filter_(demanded.acceleration_rad_s2.T).T,
     )
+
+
+def _instruments(
+    model: Model, data: Dataset, demanded: Motion, piece: slice, conditioning: Conditioning
+) -> FloatArray:
+    """Columns of the parameters of some rows for the demanded motion, shape (m, c, r).
+
+    Args:
+        model: the declared model.
+        data: the run.
+        demanded: its demanded motion at all rows.
+        piece: the rows.
+        conditioning: the filters.
+    """
+    rate_hz = data.rate_hz / row_filter(data, conditioning).factor
+    memory = memory_samples(rate_hz, conditioning)
+    first = max(piece.start - memory, 0)
+    around = slice(first, piece.stop + memory)
+    columns = model.regressor(_part(demanded, around), loaded=data.payload is not None)
+    recorded = as_recorded(rate_hz, conditioning, columns)
+    return recorded[..., piece.start - first : piece.stop - first]
 
 
 def _part(motion: Motion, rows: slice) -> Motion:

@@ -20,7 +20,7 @@ from math import ceil
 import numpy as np
 
 from ident.arrays import BoolArray
-from ident.data.conditioning import Conditioning, decimator
+from ident.data.conditioning import Conditioning, current_rows
 from ident.data.dataset import Dataset, differentiate
 from ident.data.run import Run
 from ident.equations.rows import Rows, row_filter, row_masks, rows_of
@@ -86,7 +86,7 @@ def new_rows(
                 run.name, f"{samples} samples; expected at least 3, for a sampling rate"
             )
         before = RunProgress(run.name, run.rate_hz, rows=0, is_complete=False)
-    filter_ = decimator(before.rate_hz, conditioning.decimation_cutoff_hz)
+    filter_ = current_rows(before.rate_hz, conditioning)
     settled = ceil(SETTLED_PERIODS * before.rate_hz / conditioning.position_cutoff_hz)
     shortest = ceil(SHORTEST_S * before.rate_hz) + len(filter_.taps)
     if samples < shortest and not is_complete:

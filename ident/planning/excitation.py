@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ident.arrays import BoolArray, FloatArray
-from ident.data.conditioning import Conditioning, decimator
+from ident.data.conditioning import Conditioning, current_rows
 from ident.data.dataset import Dataset
 from ident.equations.currents import whitening_transform
 from ident.equations.rows import row_filter, row_masks
@@ -410,7 +410,7 @@ def rows_between_rests(conditioning: Conditioning) -> tuple[float, float]:
     A row counts when its filter window is so far from a standstill that enough of its weight is
     outside.
     """
-    filter_ = decimator(RATE_HZ, conditioning.decimation_cutoff_hz)
+    filter_ = current_rows(RATE_HZ, conditioning)
     weights = np.abs(filter_.taps)
     share = np.cumsum(weights) / weights.sum()
     at_rest = int(np.searchsorted(share, conditioning.standstill_share))

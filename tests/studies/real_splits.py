@@ -18,6 +18,7 @@ import numpy as np
 from daq.config.cell import model_of
 from ident.arrays import FloatArray
 from ident.data.run import Run
+from ident.discovery.current_filter import find_current_filter
 from ident.discovery.evidence import Evidence, gather, with_effects
 from ident.discovery.loop import Step, find_effects
 from ident.effects.effect import PlacedEffect
@@ -150,6 +151,12 @@ def judge_unit(unit: SplitUnit) -> tuple[JudgedEffect, ...]:
     found = identify(
         model_of(cell), rest, cell.conditioning, method=Method.ML, fixed_gains=recording.gains
     )
+    current_filter = find_current_filter(gather(found, rest))
+    if current_filter is not None:
+        conditioning = current_filter.applied_to(cell.conditioning)
+        found = identify(
+            model_of(cell), rest, conditioning, method=Method.ML, fixed_gains=recording.gains
+        )
     # The search is given no row of the part that judges it.
     rng = np.random.default_rng(0)
     steps = find_effects(gather(found, rest), rng)

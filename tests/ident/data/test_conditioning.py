@@ -8,7 +8,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import signal
 
-from ident.data.conditioning import LONG_SERIES, decimator, low_pass
+from ident.data.conditioning import (
+    LONG_SERIES,
+    Conditioning,
+    current_rows,
+    decimator,
+    low_pass,
+    rows_lost,
+    torque_rows,
+)
 
 
 @settings(max_examples=40, deadline=None)
@@ -96,3 +104,48 @@ def test_nothing_comes_out_of_less_than_one_window() -> None:
     filter_ = decimator(1000.0, 20.0)
     assert filter_.rows(len(filter_.taps) - 1) == 0
     assert filter_.rows(len(filter_.taps)) == 1
+
+
+@pytest.mark.parametrize("order", [0, 2, 3])
+def test_torque_rows_are_currents_rows_behind_the_low_pass_of_the_currents(order: int) -> None:
+    rate_hz = 125.0
+    series = np.cumsum(np.random.default_rng(0).standard_normal((2, 2000)), axis=1)
+    filtered = Conditioning(decimation_cutoff_hz=7.0, current_cutoff_hz=2.0, current_order=order)
+    if order:
+        sections = signal.butter(order, 2.0, fs=rate_hz, output="sos")
+        expected = signal.sosfiltfilt(sections, series, axis=1)
+    else:
+        pole = 2.0 * np.pi * 2.0
+        times = np.arange(2000) / rate_hz
+        expected = np.array([signal.lsim(([pole], [1.0, pole]), own, times)[1] for own in series])
+    torque = torque_rows(rate_hz, filtered)(series)
+    current = current_rows(rate_hz, filtered)(expected)
+    scale = np.abs(series).max()
+    # Beyond its window the response has a hundredth left, in slow waves.
+    assert np.abs(torque - current)[:, 10:-10].max() < 0.01 * scale
+    assert torque.shape == current.shape
+
+
+def test_rows_with_a_filter_of_the_currents_are_those_without_but_for_the_ends() -> None:
+    plain = Conditioning(decimation_cutoff_hz=7.0)
+    filtered = Conditioning(decimation_cutoff_hz=7.0, current_cutoff_hz=2.0, current_order=3)
+    lost = rows_lost(125.0, filtered)
+    centres = current_rows(125.0, plain).centres(2000)
+    own = current_rows(125.0, filtered).centres(2000)
+    np.testing.assert_array_equal(own, centres[lost : len(centres) - lost])
+    series = np.random.default_rng(1).standard_normal((1, 2000))
+    rows = current_rows(125.0, plain)(series)
+    np.testing.assert_allclose(current_rows(125.0, filtered)(series), rows[:, lost:-lost])
+
+
+def test_without_a_filter_of_the_currents_torques_and_currents_have_one_decimator() -> None:
+    plain = Conditioning()
+    assert torque_rows(250.0, plain) is decimator(250.0, plain.decimation_cutoff_hz)
+    assert current_rows(250.0, plain) is decimator(250.0, plain.decimation_cutoff_hz)
+    assert "current_cutoff_hz" not in plain.document()
+    assert Conditioning.of_document(plain.document()) == plain
+
+
+def test_a_document_holds_the_filter_of_the_currents() -> None:
+    filtered = Conditioning(current_cutoff_hz=1.74, current_order=3)
+    assert Conditioning.of_document(filtered.document()) == filtered
