@@ -1,16 +1,20 @@
-"""Whether the friction of an axis brakes at every speed: it never drives the arm.
+"""Whether the friction of an axis brakes at every speed and position: it never drives the arm.
 
 A joint fit is of the speeds that its runs have. Terms that depend on the speed alone can stand in
 for each other there: drag by a root of the speed, with a dry friction below zero, is right from a
 tenth of full speed on, and wrong below it. An axis of a real robot moved slowly in a region that
 was left out: there such a fit was off by 18 % of the torque, and the fit without the term by 5 %.
-So dry and viscous friction are judged together with all effects of the speed on the axis,
+Friction that depends on the position is as bad where the runs have not been: with it, a region that
+was left out was off by 9 % of the torque, and by 4 % without.
+So dry and viscous friction are judged together with all effects of the speed and of the position on
+the axis,
 
-    f(v) = fs + fv |v| + sign(v) Σ c φ(v) ≥ 0,     0 < |v| ≤ the largest speed of the runs,
+    f(v, q) = fs + fv |v| + sign(v) Σ c φ(v) + a cos q + b sin q ≥ 0,
 
-in both directions, and may be below zero by no more than SIGMAS of its own σ. At rest, f is what
-the friction of the axis begins with. Friction that grows with the load, or depends on position or
-distance, brakes too and is left out. An axis whose friction depends on the temperature is not
+for 0 < |v| ≤ the largest speed of the runs, in both directions, and all q within the joint's travel
+about the middle of its runs. It may be below zero by no more than SIGMAS of its own σ. At rest,
+f is what the friction of the axis begins with. Friction that grows with the load, or depends on
+the distance, brakes too and is left out. An axis whose friction depends on the temperature is not
 judged: fs and fv are then those of a temperature that the runs need not have.
 """
 
@@ -25,16 +29,20 @@ from ident.arrays import FloatArray
 from ident.discovery.evidence import Evidence
 from ident.discovery.gates import SIGMAS, own_unknowns
 from ident.effects.effect import PlacedEffect
-from ident.effects.friction import SpeedFriction
+from ident.effects.friction import PositionFriction, SpeedFriction
 from ident.effects.signals import Abscissa
 from ident.model.bodies import LOADED
+from ident.model.regressor import cos_sin
 
 SPEEDS = np.concatenate(([1e-6], np.geomspace(1e-3, 1.0, 25)))
 """Shares of the largest speed; the first one stands for the limit at rest."""
 
+POSITIONS = 48
+"""Positions at which friction that depends on the position is judged: 7.5° of a turn."""
+
 
 def pushing(evidence: Evidence, axis: int) -> str:
-    """Say at which speed the friction of an axis would push; empty where it brakes at all of them.
+    """Say where the friction of an axis would push; empty where it brakes everywhere.
 
     Args:
         evidence: a joint fit.
@@ -42,29 +50,32 @@ def pushing(evidence: Evidence, axis: int) -> str:
     """
     of_axis = [placed for placed in evidence.effects if placed.axis == axis]
     terms: list[tuple[PlacedEffect, SpeedFriction]] = []
+    of_position: list[PlacedEffect] = []
     for placed in of_axis:
         if placed.effect.abscissa is Abscissa.TEMPERATURE:
             return ""
         if isinstance(placed.effect, SpeedFriction):
             terms.append((placed, placed.effect))
-    if not terms:
+        if isinstance(placed.effect, PositionFriction):
+            of_position.append(placed)
+    if not terms and not of_position:
         return ""
+    positions = np.zeros(1)
+    if of_position:
+        positions = _positions(evidence, axis)
     speeds = [np.abs(data.velocity_rad_s[:, axis]) for data in evidence.fit_runs]
     fastest = max(float(np.max(speed)) for speed in speeds)
     found: list[_Friction] = []
     for declared in _declared_friction(evidence, axis):
         for direction in (1.0, -1.0):
             velocity = direction * fastest * SPEEDS
-            found += _friction_at(evidence, declared, terms, velocity)
+            found += _friction_at(evidence, declared, terms, of_position, velocity, positions)
     worst = min(found, key=lambda one: one.at_most, default=None)
     if worst is None or worst.at_most >= 0.0:
         return ""
-    if abs(worst.speed) < 2.0 * fastest * SPEEDS[0]:
-        where = "at rest"
-    elif worst.unit == "N":
-        where = f"at {worst.speed:.2g} m/s"
-    else:
-        where = f"at {worst.speed:.2g} rad/s"
+    where = _place(worst, fastest)
+    if of_position:
+        where += f", where its position is {worst.position_rad:.2g} rad"
     torque = f"{worst.torque:.3g} ± {worst.std:.2g} {worst.unit}"
     return f"the friction of this axis would push the arm {where} ({torque})"
 
@@ -83,9 +94,10 @@ class _Declared:
 
 @dataclass(frozen=True, slots=True)
 class _Friction:
-    """Friction of an axis at one speed; positive where it brakes."""
+    """Friction of an axis at one speed and position; positive where it brakes."""
 
     speed: float  #: [rad/s or m/s]
+    position_rad: float  #: 0 where no friction depends on it
     torque: float  #: [unit]
     std: float  #: [unit]
     unit: str
@@ -94,6 +106,15 @@ class _Friction:
     def at_most(self) -> float:
         """The largest friction that its σ allows [unit]."""
         return self.torque + SIGMAS * self.std
+
+
+def _place(worst: _Friction, fastest: float) -> str:
+    """At which speed a friction is, in words."""
+    if abs(worst.speed) < 2.0 * fastest * SPEEDS[0]:
+        return "at rest"
+    if worst.unit == "N":
+        return f"at {worst.speed:.2g} m/s"
+    return f"at {worst.speed:.2g} rad/s"
 
 
 def _declared_friction(evidence: Evidence, axis: int) -> list[_Declared]:
@@ -119,28 +140,62 @@ def _declared_friction(evidence: Evidence, axis: int) -> list[_Declared]:
     return [bare, loaded]
 
 
+def _positions(evidence: Evidence, axis: int) -> FloatArray:
+    """Positions of a joint at which its friction is judged, shape (POSITIONS,).
+
+    They reach as far as its travel, about the middle of its runs; a turn holds all of a cosine.
+    """
+    robot = evidence.model.robot
+    joint = robot.joints[robot.axis_joints[axis]]
+    reach_rad = 2.0 * np.pi
+    if joint.travel is not None:
+        reach_rad = min(joint.travel, reach_rad)
+    lowest = min(float(np.min(data.position_rad[:, axis])) for data in evidence.fit_runs)
+    highest = max(float(np.max(data.position_rad[:, axis])) for data in evidence.fit_runs)
+    reach_rad = max(reach_rad, highest - lowest)
+    middle = 0.5 * (lowest + highest)
+    return middle + reach_rad * np.linspace(-0.5, 0.5, POSITIONS)
+
+
 def _friction_at(
     evidence: Evidence,
     declared: _Declared,
-    terms: Sequence[tuple[PlacedEffect, SpeedFriction]],
-    velocity: FloatArray,
+    of_speed: Sequence[tuple[PlacedEffect, SpeedFriction]],
+    of_position: Sequence[PlacedEffect],
+    speeds: FloatArray,
+    positions_rad: FloatArray,
 ) -> list[_Friction]:
-    """Friction at velocities of one sign, shape (k,)."""
+    """Friction at each of some velocities of one sign, shape (k,), and positions, shape (n,)."""
     estimate = evidence.estimate
     values = np.concatenate((estimate.gains, estimate.parameters))
     first = len(estimate.gains)
     dry = first + np.array(declared.dry)
     viscous = first + np.array(declared.viscous)
-    # Row k of the weights w is ∂f(v_k)/∂(g, χ): f = w χ, and its variance is w C wᵀ.
+    velocity = np.repeat(speeds, len(positions_rad))
+    position_rad = np.tile(positions_rad, len(speeds))
+    # Row k of the weights w is ∂f(v_k, q_k)/∂(g, χ): f = w χ, and its variance is w C wᵀ.
     weights = np.zeros((len(velocity), len(values)))
     weights[:, dry] = 1.0
     weights[:, viscous] = np.abs(velocity)[:, None]
-    for placed, effect in terms:
+    for placed, effect in of_speed:
         against_motion = np.sign(velocity) * effect.at_speed(velocity)
         of_effect = first + own_unknowns(estimate, (placed,))
         weights[:, of_effect] = against_motion.T
+    for placed in of_position:
+        of_effect = first + own_unknowns(estimate, (placed,))
+        weights[:, of_effect] = np.stack(cos_sin(position_rad), axis=-1)
     torque = weights @ values
-    variance = np.einsum("kp,pq,kq->k", weights, estimate.covariance, weights)
+    variance = np.einsum("kp,pq,kq->k", weights, estimate.covariance, weights, optimize=True)
     std = np.sqrt(variance)
-    at_each = zip(velocity.tolist(), torque.tolist(), std.tolist(), strict=True)
-    return [_Friction(*numbers, declared.unit) for numbers in at_each]
+    found: list[_Friction] = []
+    for place in range(len(velocity)):
+        found.append(
+            _Friction(
+                speed=float(velocity[place]),
+                position_rad=float(position_rad[place]),
+                torque=float(torque[place]),
+                std=float(std[place]),
+                unit=declared.unit,
+            )
+        )
+    return found

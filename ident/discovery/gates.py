@@ -31,6 +31,7 @@ from ident.estimators.estimate import Estimate
 from ident.model.model import Column
 
 SIGMAS = 2.0  #: A coefficient outside its possible values by more than this many σ is impossible
+AMPLITUDE_SIGMAS = 3.0  #: An amplitude is at least this many σ at every angle
 MIN_RUNS = 3  #: With two runs, one left out leaves a fit of the other alone
 REGIONS = 8  #: Of the workspace, that are left out in turn where no run can be
 MOVES_OF_REGION = 2  #: Fewest moves of a region
@@ -127,6 +128,27 @@ def in_noise(values: FloatArray, covariance: FloatArray, confidence: float = CON
     if probability <= 1.0 - confidence:
         return ""
     return f"its coefficients may all be zero (p = {probability:.2f})"
+
+
+def uncertain_amplitude(values: FloatArray, covariance: FloatArray) -> str:
+    """Why the amplitude of a cosine and a sine is not known at every angle; empty where it is.
+
+    The data may show the amplitude where the axis has been, and leave it open at other angles: the
+    torque there is a guess. So the largest σ at any angle, the root of the largest eigenvalue of
+    the covariance, must be at most 1/AMPLITUDE_SIGMAS of the amplitude.
+
+    Args:
+        values: coefficients of the cosine and the sine, shape (2,).
+        covariance: of these, shape (2, 2).
+    """
+    amplitude = float(np.linalg.norm(values))
+    largest_std = float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
+    if AMPLITUDE_SIGMAS * largest_std <= amplitude:
+        return ""
+    return (
+        f"its amplitude of {amplitude:.3g} is known to {largest_std:.2g} only at some angles: "
+        "record moves in which this axis turns further"
+    )
 
 
 def certain_delays(seconds: FloatArray, deviations: FloatArray) -> BoolArray:

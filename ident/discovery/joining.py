@@ -43,6 +43,7 @@ from ident.discovery.gates import (
     moved_gains,
     own_unknowns,
     runs_to_leave_out,
+    uncertain_amplitude,
     values_of,
     whitened_columns,
     without_effects_of,
@@ -52,8 +53,8 @@ from ident.discovery.refinement import refine_together
 from ident.discovery.rotor_search import refined_rotor
 from ident.discovery.search import EffectKey, Finding, effect_key, is_better, rank_families
 from ident.discovery.structure import is_inadequate
-from ident.effects.effect import Effect, PlacedEffect
-from ident.effects.friction import SpeedFriction
+from ident.effects.effect import Effect, PlacedEffect, Reported
+from ident.effects.friction import PositionFriction, SpeedFriction
 from ident.effects.geometry_corrections import LatePosition, is_correction
 from ident.effects.signals import Abscissa
 from ident.effects.unnamed import is_unnamed
@@ -435,12 +436,14 @@ def beside_others(
     place = len(estimate.gains) + own
     joint = in_noise(values, estimate.covariance[np.ix_(place, place)])
     deviations = estimate.parameters_std[own]
+    amplitude = ""
+    if placed.effect.reported is Reported.AMPLITUDE:
+        amplitude = uncertain_amplitude(values, estimate.covariance[np.ix_(place, place)])
     uncertain = ""
     if is_delay:
         uncertain = _uncertain_delay(finding, values, deviations, gates)
     physics = impossible(placed.effect.coefficients, values, deviations)
-    is_of_speed = isinstance(placed.effect, SpeedFriction)
-    if is_of_speed:
+    if isinstance(placed.effect, SpeedFriction | PositionFriction):
         drives = pushing(model.evidence, placed.axis)
     else:
         drives = ""
@@ -448,6 +451,7 @@ def beside_others(
         *finding.refusals,
         joint,
         uncertain,
+        amplitude,
         physics,
         drives,
         PartsLeftOut.of(problem).refusal(columns),

@@ -18,7 +18,13 @@ from ident.discovery.gates import Gates
 from ident.discovery.joining import SetAside
 from ident.discovery.loop import find_effects
 from ident.effects.effect import PlacedEffect
-from ident.effects.friction import AsymmetricViscous, NonlinearViscous, SpeedFriction, Stribeck
+from ident.effects.friction import (
+    AsymmetricViscous,
+    NonlinearViscous,
+    PositionFriction,
+    SpeedFriction,
+    Stribeck,
+)
 from tests.ident.recordings import (
     MOUNTED,
     Truth,
@@ -180,3 +186,46 @@ def test_friction_with_a_payload_is_judged_by_itself(truth: Truth) -> None:
     estimate = replace(fitted.estimate, parameters=parameters)
     lighter = replace(fitted, estimate=estimate)
     assert "would push the arm" in pushing(lighter, AXIS)
+
+
+def _with_swing(clean: Evidence, truth: Truth, swing_nm: float, offset_nm: float) -> Evidence:
+    """Recordings whose dry friction on one axis has a cosine of the position, and an offset."""
+
+    def torque(data: Dataset) -> FloatArray:
+        position = data.position_rad[:, AXIS]
+        size_nm = swing_nm * np.cos(position) + offset_nm
+        own = np.sign(data.velocity_rad_s[:, AXIS]) * size_nm
+        return acting_on(AXIS, len(truth.gains), own)
+
+    return bent(clean, truth, torque)
+
+
+def test_friction_that_pushes_at_a_position_is_named_with_that_position(
+    clean: Evidence, truth: Truth
+) -> None:
+    # 25 Nm of a cosine on a dry friction of less: half a turn from zero it would push.
+    worn = _with_swing(clean, truth, 25.0, -10.0)
+    fitted = with_effects(worn, (PlacedEffect(PositionFriction(), AXIS),))
+    said = pushing(fitted, AXIS)
+    assert said.startswith("the friction of this axis would push the arm at rest, where its")
+    position_rad = float(re.findall(r"position is (-?[\d.]+) rad", said)[0])
+    assert np.cos(position_rad) < 0.0
+    assert pushing(fitted, 0) == ""
+
+
+def test_friction_that_brakes_at_every_position_may_depend_on_it(
+    clean: Evidence, truth: Truth
+) -> None:
+    worn = _with_swing(clean, truth, 4.0, 4.0)
+    fitted = with_effects(worn, (PlacedEffect(PositionFriction(), AXIS),))
+    assert pushing(fitted, AXIS) == ""
+
+
+def test_the_search_writes_no_friction_of_the_position_that_drives_the_arm(
+    clean: Evidence, truth: Truth
+) -> None:
+    worn = _with_swing(clean, truth, 25.0, -10.0)
+    steps = find_effects(worn, np.random.default_rng(0), GATES)
+    end = steps[-1].after
+    assert all(pushing(end, axis) == "" for axis in range(3))
+    assert all(placed.effect.name != "position-friction" for placed in end.effects)

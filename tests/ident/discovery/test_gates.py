@@ -30,6 +30,7 @@ from ident.discovery.gates import (
     possible_values,
     regions_to_leave_out,
     runs_to_leave_out,
+    uncertain_amplitude,
     whitened_columns,
     without_effects_of,
 )
@@ -744,3 +745,19 @@ def test_a_hose_only_pulls_and_a_current_is_early_by_milliseconds() -> None:
     deviations = np.array([0.003])
     assert impossible(Lag().coefficients, np.array([-0.021]), deviations)
     assert not impossible(Lag().coefficients, np.array([-0.004]), np.array([0.001]))
+
+
+def test_an_amplitude_that_is_known_at_some_angles_only_says_to_turn_further() -> None:
+    # The cosine is six σ from zero; at the angles of the sine nothing is known.
+    values = np.array([6.0, 0.5])
+    covariance = np.diag([1.0, 9.0])
+    said = uncertain_amplitude(values, covariance)
+    assert said.startswith("its amplitude of 6.02 is known to 3 only at some angles")
+    turned = np.array([[0.6, -0.8], [0.8, 0.6]])
+    rotated = uncertain_amplitude(turned @ values, turned @ covariance @ turned.T)
+    assert rotated == said
+
+
+def test_an_amplitude_of_three_sigma_at_every_angle_is_known() -> None:
+    assert uncertain_amplitude(np.array([3.0, 0.0]), np.eye(2)) == ""
+    assert uncertain_amplitude(np.array([2.9, 0.0]), np.eye(2)) != ""
