@@ -86,7 +86,7 @@ class Conditioning:
             found.setdefault(name, 0)
         lists = [name for name, value in found.items() if isinstance(value, list)]
         if found.keys() != expected.keys() or lists != ["standstill_rad_s"]:
-            given = ", ".join(f"{name}: {value}" for name, value in found.items()) or "nothing"
+            given = ", ".join(f"{name}: {value}" for name, value in document.items()) or "nothing"
             numbers = ", ".join(sorted(expected.keys() - NOT_NEEDED))
             raise ModelError(
                 f"the filter of the calibration: found {given}; expected a list standstill_rad_s "
