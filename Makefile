@@ -46,7 +46,7 @@ help:
 	@echo "make write-fault-study  kills, errors and short writes at every changing system call of apply, rollback, recalibrate and calibrate (docs/evidence/write-path.md); VERBS=\"apply calibrate\" EVERY=3 MINUTES=20; resumable, an hour"
 	@echo "make guard-study  the axes of a recorder killed by kill -9, with a foreign node on every id from 1 to 127; minutes"
 	@echo "make console-study  60 minutes on SocketCAN with the console alternately open and closed: losses, jitter, processor, memory"
-	@echo "make soak    recordings at rising rates beside an open console and screens that nobody reads: what the host lost, and what we lost (docs/evidence/stream.md); MINUTES=60 REALTIME=1; resumable, more than an hour"
+	@echo "make soak    recordings at rising rates with the console open and screens stalled: what the host lost, and what drivegain lost (docs/evidence/stream.md); MINUTES=60 REALTIME=1; resumable, more than an hour"
 	@echo "make drift-study  detection delay and false alarms of a drifting gain (docs/evidence/drift.md); a minute"
 	@echo "make holdout-study  which wrong gains the hold-out gate detects (docs/evidence/hold-out.md); a minute"
 	@echo "make diagnosis-study  false alarms of the diagnoses on clean recordings, and planted mistakes that are named; time skews that are printed; ten minutes"

@@ -72,6 +72,10 @@ if TYPE_CHECKING:  # the names of a module stand together
     )
     from ident.data.torque_channel import TorqueChannel as TorqueChannel
     from ident.discovery.acceptance import accept_on_holdout as accept_on_holdout
+    from ident.discovery.current_filter import (
+        CurrentFilter as CurrentFilter,
+        find_current_filter as find_current_filter,
+    )
     from ident.discovery.effect_verdict import (
         EffectVerdict as EffectVerdict,
         Judgement as Judgement,

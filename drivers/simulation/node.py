@@ -147,8 +147,9 @@ class Node:
             self._heard_wall_s = wall_s
 
     def excuse_silence(self, seconds: float) -> None:
-        """Leave out a time in which the cell did not run, and so heard nobody:
-        the heartbeats of it may still wait to be read.
+        """Do not count a time in which the cell did not run as silence of the master.
+
+        The heartbeats of that time may still wait to be read.
         """
         if self._heard_wall_s is not None:
             self._heard_wall_s += seconds

@@ -111,7 +111,7 @@ class Conditioning:
 
 
 def require_settings(conditioning: Conditioning) -> None:
-    """Refuse settings that are no numbers, and an order that no filter of positions has.
+    """Refuse settings that are no numbers, and orders that no filter has.
 
     Cut-offs are compared with the sampling rate of each run.
 
@@ -121,13 +121,19 @@ def require_settings(conditioning: Conditioning) -> None:
     numbers = {
         "position_cutoff_hz": conditioning.position_cutoff_hz,
         "decimation_cutoff_hz": conditioning.decimation_cutoff_hz,
+        "current_cutoff_hz": conditioning.current_cutoff_hz,
         "standstill_share": conditioning.standstill_share,
     }
     for name, value in numbers.items():
         require_kind(f"{name} of the conditioning", value, Real, "give a number")
-    label = "position_order of the conditioning"
     least, largest = FILTER_ORDER
-    order = require_count(label, conditioning.position_order, remedy="give a number such as 4")
+    _require_order("position_order", conditioning.position_order, least, largest)
+    _require_order("current_order", conditioning.current_order, 0, largest)
+
+
+def _require_order(name: str, value: object, least: int, largest: int) -> None:
+    label = f"{name} of the conditioning"
+    order = require_count(label, value, remedy="give a number such as 4")
     if not least <= order <= largest:
         raise ModelError(f"{label} is {order}; expected {least} to {largest}; 4 is usual")
 
@@ -346,10 +352,9 @@ def current_rows(rate_hz: float, conditioning: Conditioning) -> Decimator:
 
 
 def torque_rows(rate_hz: float, conditioning: Conditioning) -> Decimator:
-    """Decimator of the torques that are compared with the currents:
-    through the low-pass of the currents, too.
+    """Decimator of the torques that are compared with the currents.
 
-    Without such a low-pass it is that of the currents.
+    It has the low-pass of the currents, too; without such a low-pass it is that of the currents.
     """
     plain = decimator(rate_hz, conditioning.decimation_cutoff_hz)
     if not conditioning.current_cutoff_hz:
@@ -378,10 +383,10 @@ def memory_samples(rate_hz: float, conditioning: Conditioning) -> int:
 
 
 def as_recorded(rate_hz: float, conditioning: Conditioning, columns: FloatArray) -> FloatArray:
-    """Columns of torque as the recorded currents show them, shape (..., k):
-    through the low-pass of the currents where they went through one, and at the same rate.
+    """Columns of torque as the recorded currents show them, shape (..., k), at the same rate.
 
-    Outside of them they are as in their first and last entry.
+    They go through the low-pass of the currents where there is one. Before the first and after the
+    last entry they are taken to stay as they are there.
 
     Args:
         rate_hz: of the series; that of the rows where the columns were made of decimated motion.
@@ -419,7 +424,7 @@ def _response(rate_hz: float, cutoff_hz: float, order: int) -> FloatArray:
 
 
 def _zero_phase_response(rate_hz: float, cutoff_hz: float, order: int) -> FloatArray:
-    """Of a Butterworth low-pass forwards and backwards."""
+    """Response of a Butterworth low-pass that is applied forwards and backwards."""
     length = ceil(RESPONSE_PERIODS * rate_hz / cutoff_hz)
     impulse = np.zeros((1, 2 * length + 1))
     impulse[0, length] = 1.0
@@ -427,7 +432,7 @@ def _zero_phase_response(rate_hz: float, cutoff_hz: float, order: int) -> FloatA
 
 
 def _lag_response(rate_hz: float, cutoff_hz: float) -> FloatArray:
-    """Of a low-pass of first order, as a drive has it.
+    """Response of a causal low-pass of first order, as drives have it.
 
     T ẏ + y = x with T = 1/(2π cut-off) is solved exactly for an x that is straight between
     samples: y_k = a y_k−1 + b_0 x_k + b_1 x_k−1 with w = 1/(rate T), a = e^−w,

@@ -4,8 +4,7 @@ A joint fit is of the speeds that its runs have. Terms that depend on the speed 
 for each other there: drag by a root of the speed, with a dry friction below zero, is right from a
 tenth of full speed on, and wrong below it. An axis of a real robot moved slowly in a region that
 was left out: there such a fit was off by 18 % of the torque, and the fit without the term by 5 %.
-Friction that depends on the position is as bad where the runs have not been: with it, a region that
-was left out was off by 9 % of the torque, and by 4 % without.
+Friction that depends on the position can be below zero where no run has been.
 So dry and viscous friction are judged together with all effects of the speed and of the position on
 the axis,
 
@@ -49,27 +48,29 @@ def pushing(evidence: Evidence, axis: int) -> str:
         axis: index of the axis.
     """
     of_axis = [placed for placed in evidence.effects if placed.axis == axis]
-    terms: list[tuple[PlacedEffect, SpeedFriction]] = []
+    of_speed: list[tuple[PlacedEffect, SpeedFriction]] = []
     of_position: list[PlacedEffect] = []
     for placed in of_axis:
         if placed.effect.abscissa is Abscissa.TEMPERATURE:
             return ""
         if isinstance(placed.effect, SpeedFriction):
-            terms.append((placed, placed.effect))
+            of_speed.append((placed, placed.effect))
         if isinstance(placed.effect, PositionFriction):
             of_position.append(placed)
-    if not terms and not of_position:
+    if not of_speed and not of_position:
         return ""
-    positions = np.zeros(1)
+    positions_rad = np.zeros(1)
     if of_position:
-        positions = _positions(evidence, axis)
+        positions_rad = _positions(evidence, axis)
     speeds = [np.abs(data.velocity_rad_s[:, axis]) for data in evidence.fit_runs]
     fastest = max(float(np.max(speed)) for speed in speeds)
     found: list[_Friction] = []
     for declared in _declared_friction(evidence, axis):
         for direction in (1.0, -1.0):
             velocity = direction * fastest * SPEEDS
-            found += _friction_at(evidence, declared, terms, of_position, velocity, positions)
+            found += _friction_at(
+                evidence, declared, of_speed, of_position, velocity, positions_rad
+            )
     worst = min(found, key=lambda one: one.at_most, default=None)
     if worst is None or worst.at_most >= 0.0:
         return ""

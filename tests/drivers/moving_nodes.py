@@ -1,6 +1,8 @@
 """Drives of another stack that move, in a process of their own on a socketcand hub.
 
-    python -m tests.drivers.moving_nodes HOST:PORT     (writes "ready" when they answer; SIGTERM ends it)
+    python -m tests.drivers.moving_nodes HOST:PORT
+
+It writes "ready" when the drives answer; SIGTERM ends it.
 
 Each is a `canopen.LocalNode`: NMT, heartbeat, SDO server and PDO maps are python-canopen's, the end
 of the bus is python-can's own. Ours are the object dictionary, the state machine of CiA 402 and a
@@ -8,7 +10,7 @@ plant: the position follows the reference, no faster than the profile velocity, 
 that of a spring between the two, with noise. Time passes with SYNC.
 
 Most encoders start away from zero, some of them below it.
-"""  # noqa: E501
+"""
 
 from __future__ import annotations
 

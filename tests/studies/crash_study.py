@@ -398,13 +398,13 @@ def study(kills: int, damages: int, seconds: float, seed: int) -> dict[str, Any]
     kept = (
         all(one.kept for one in done) and flips.kept and cuts.kept and tap.syncs == ASKED + length
     )
-    sync_difference = tap.syncs - ASKED
+    extra_syncs = tap.syncs - ASKED
     return {
         "kept": kept,
         "promised_ms": PROMISED_MS,
         "seed": seed,
         "whole": {
-            "sent": sync_difference,
+            "sent": extra_syncs,
             "logged": length,
             "as_sent": _as_sent(whole.samples, tap.answers),
         },

@@ -219,8 +219,8 @@ def case(
     # Rotors, friction and offsets have no prior of their own.
     of_link = np.isfinite(full.prior_std)
     by_data = np.array([basis is RestsOn.DATA for basis in full.basis])
-    standard_difference = np.abs(full.standard - standard)
-    inside = standard_difference < NORMAL_95 * full.standard_std
+    parameter_error = np.abs(full.standard - standard)
+    inside = parameter_error < NORMAL_95 * full.standard_std
     check = full.check
     gain_difference = full.gains - estimate.gains
     smallest_eigenvalue = float(full.eigenvalues.min())

@@ -287,6 +287,8 @@ def test_a_wait_is_counted_where_it_was_not_where_it_ended() -> None:
 def test_the_share_of_starved_periods_is_that_of_the_cycles_around_a_wait() -> None:
     made_scene = scene()
     made_scene.take(STRUCK, waited_ns=PERIOD_NS)
+    # A sample looks at the period before its SYNC and the one after: a wait over two periods is
+    # in the windows of at most four samples.
     assert 1 / CYCLES <= made_scene.judged().starved_share <= 4 / CYCLES
 
 

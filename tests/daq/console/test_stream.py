@@ -219,8 +219,8 @@ def test_the_shipped_layout_shows_what_the_stream_sends(checkout: Path) -> None:
         for path in panel.get("paths", ()):
             plotted.add(path["value"])
     topics = {path.partition(".")[0] for path in plotted}
-    topic_difference = topics - set(SCHEMAS)
-    assert topic_difference == {"/cell/samples"}  # in logs alone
+    topics_without_schema = topics - set(SCHEMAS)
+    assert topics_without_schema == {"/cell/samples"}  # in logs alone
     for topic in (PREDICTED_TOPIC, RESIDUAL_TOPIC):
         assert {f"{topic}.current_a[{axis}]" for axis in range(6)} <= plotted
 

@@ -607,8 +607,8 @@ def test_a_counter_of_fewer_than_32_bits_that_wraps(
     joint_rad = np.radians(bench.joint_deg)
     counts = np.rint(joint_rad @ load_run_of(bench).T / (2 * pi) * 65536)
     least = -(2 ** (bits - 1)) if signed else 0
-    count_difference = counts[:, 0] - least
-    wrapped = count_difference % 2**bits + least
+    counts_from_zero = counts[:, 0] - least
+    wrapped = counts_from_zero % 2**bits + least
     absolute_wrapped_step = np.abs(np.diff(wrapped))
     assert absolute_wrapped_step.max() > 2 ** (bits - 1)
     counts[:, 0] = wrapped

@@ -311,10 +311,10 @@ def _simulated_gap_m(simulated: Any, robot: CalibratedRobot) -> tuple[float, flo
     placed = poses(robot.model.robot, position_rad)
     closures = robot.model.robot.closures
     gaps = [origin(placed, closure.first) - origin(placed, closure.second) for closure in closures]
-    qpos_difference = data.qpos - start
-    largest_qpos_difference = np.abs(qpos_difference).max()
+    moved_by = data.qpos - start
+    largest_motion = np.abs(moved_by).max()
     largest_absolute_gap = np.abs(gaps).max()
-    return float(largest_qpos_difference), float(largest_absolute_gap)
+    return float(largest_motion), float(largest_absolute_gap)
 
 
 @pytest.mark.parametrize("name", CLOSED)
@@ -366,8 +366,8 @@ def test_a_joint_that_follows_an_axis_follows_it_in_mujoco(
     data.ctrl[4] = 3.0 * gain_sign  # that of J5, in A
     for _ in range(200):
         mujoco.mj_step(simulated, data)
-    qpos_difference = data.qpos[leader] - start
-    assert abs(qpos_difference) > 0.02
+    moved_by = data.qpos[leader] - start
+    assert abs(moved_by) > 0.02
     assert data.qpos[follower] == pytest.approx(0.1 - 0.5 * data.qpos[leader], abs=2e-3)
 
 

@@ -36,8 +36,8 @@ def begin_move(
     master: Master, spec: CellSpec, target: FloatArray, duration_s: float, ramp_s: float
 ) -> None:
     """A synchronised trapezoid; it starts with the next SYNC."""
-    target_difference = target - spec.start_rad
-    speed = target_difference / (duration_s - ramp_s)
+    travel_rad = target - spec.start_rad
+    speed = travel_rad / (duration_s - ramp_s)
     rows = zip(counts(spec, target), counts(spec, speed), counts(spec, speed / ramp_s), strict=True)
     for node_id, (place, velocity, acceleration) in enumerate(rows, start=1):
         settings = [(0x607A, "i", place), (0x6081, "I", abs(velocity))]

@@ -68,5 +68,5 @@ def test_a_stop_ends_at_rest_where_it_says(
         move.target, abs=1e-6 * (1.0 + abs(start) + velocity**2 / deceleration)
     )
     assert abs(left) <= 1e-6 * (1.0 + abs(velocity))
-    target_difference = move.target - start
-    assert target_difference * velocity >= 0.0
+    travel = move.target - start
+    assert travel * velocity >= 0.0

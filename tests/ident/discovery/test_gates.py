@@ -752,7 +752,7 @@ def test_an_amplitude_that_is_known_at_some_angles_only_says_to_turn_further() -
     values = np.array([6.0, 0.5])
     covariance = np.diag([1.0, 9.0])
     said = uncertain_amplitude(values, covariance)
-    assert said.startswith("its amplitude of 6.02 is known to 3 only at some angles")
+    assert said.startswith("its amplitude is 6.02, and its σ up to 3 at some angles")
     turned = np.array([[0.6, -0.8], [0.8, 0.6]])
     rotated = uncertain_amplitude(turned @ values, turned @ covariance @ turned.T)
     assert rotated == said

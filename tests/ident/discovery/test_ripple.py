@@ -67,8 +67,8 @@ def test_an_order_between_the_whole_ones_is_named(
     position_rad = [data.position_rad[:, axis] for data in small.datasets]
     stacked_position_rad = np.concatenate(position_rad)
     range_rev = np.ptp(stacked_position_rad) / (2.0 * np.pi)
-    order_difference = abs(effect.order - order)
-    assert order_difference * 40.0 * range_rev < 0.1
+    order_error = abs(effect.order - order)
+    assert order_error * 40.0 * range_rev < 0.1
     found = last.estimate.parameters[len(last.rows_without_effects.columns) :][:2]
     assert np.hypot(*found) == pytest.approx(4.0, rel=0.1)
 

@@ -102,8 +102,8 @@ def test_keeps_singular_values_that_the_gram_matrix_loses() -> None:
     matrix = (left * truth) @ right.T
     cuts = list(range(100, 3000, 100))
     streamed = np.linalg.svd(_streamed(matrix, cuts), compute_uv=False)
-    streamed_difference = np.abs(streamed - truth)
-    assert np.max(streamed_difference) < 1e-14
+    streamed_error = np.abs(streamed - truth)
+    assert np.max(streamed_error) < 1e-14
     gram = np.sqrt(np.abs(np.linalg.eigvalsh(matrix.T @ matrix)))[::-1]
     assert abs(gram[-1] / truth[-1] - 1.0) > 1.0
 

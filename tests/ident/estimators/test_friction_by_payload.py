@@ -227,7 +227,7 @@ def test_a_body_is_weighed_beside_bare_runs_of_another_friction(
     mass = list(LINK_PARAMETERS).index("m")
     weighed = weigh(calibration, model, (loaded,), CONDITIONING, bare=(bare,))
     one_friction = weigh(calibration, truth.model, (loaded,), CONDITIONING, bare=(bare,))
-    weighed_difference = weighed.values[mass] - PAYLOAD_TRUTH["m"]
-    error_kg = abs(weighed_difference)
+    mass_error_kg = weighed.values[mass] - PAYLOAD_TRUTH["m"]
+    error_kg = abs(mass_error_kg)
     assert error_kg < 3.0 * weighed.std[mass]
     assert weighed.std[mass] < 0.3 * one_friction.std[mass]

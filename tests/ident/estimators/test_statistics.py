@@ -176,8 +176,8 @@ def test_the_triangles_give_the_formulas_of_all_rows(noisy: Evidence) -> None:
     vector = vt[-1] / vt[-1, -1]
     matrix_difference = matrix - np.outer(matrix @ vt[-1], vt[-1])
     compatible = matrix_difference[:, :-1]
-    count_difference = count - matrix.shape[1]
-    noise = s[-1] ** 2 / count_difference
+    degrees_of_freedom = count - matrix.shape[1]
+    noise = s[-1] ** 2 / degrees_of_freedom
     size = 1.0 + np.sum(vector[:-1] ** 2)
     total = tls(rows.system(), Scaling.NONE)
     assert np.concatenate((total.gains, total.parameters)) == pytest.approx(

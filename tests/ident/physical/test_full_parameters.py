@@ -121,8 +121,8 @@ def test_sigma_is_true_and_nothing_is_bent(small: Evidence, small_truth: Truth) 
         full = full_parameters(found.system, estimate, prior)
         gain_difference = full.gains - exact.gains
         gains.append(gain_difference / full.gains_std)
-        standard_difference = full.standard - small_truth.parameters
-        standard.append(standard_difference / full.standard_std)
+        parameter_error = full.standard - small_truth.parameters
+        standard.append(parameter_error / full.standard_std)
         base_difference = full.base - exact.parameters[: len(full.base)]
         base.append(base_difference / full.base_std)
         ratios.append((full.check.mass_ratio - 1.0) / full.check.mass_ratio_std)
