@@ -641,9 +641,8 @@ class _Rows:
         self._decide(zero_is_a_time=self._zero_is_a_time is True)
         self._require_one_publisher()
         width = len(self._columns)
-        present = np.frombuffer(self._present, dtype=np.bool_)
-        present = present.reshape(-1, width)
-        values = np.frombuffer(self._values).reshape(-1, width)
+        present: BoolArray = np.frombuffer(self._present, dtype=np.bool_).reshape(-1, width)
+        values: FloatArray = np.frombuffer(self._values).reshape(-1, width)
         stamp_ns = self._stamp_ns
         if self._rhythm is not None:
             is_chosen = self._chosen_rhythm(self._rhythm)
