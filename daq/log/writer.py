@@ -1,4 +1,6 @@
-"""Write a log that survives a crash: at most the last 200 ms are only in memory."""
+"""Write a log that survives a crash: at most the last 200 ms are only in memory, and what a slow
+disk has not taken yet.
+"""
 
 from __future__ import annotations
 
@@ -48,6 +50,7 @@ from daq.log.metadata import (
     sealed,
     statistics_record,
 )
+from daq.log.queued_file import QueuedFile
 from drivers.messages import CellEvent, Sample, SlowReading
 
 FLUSH_NS = 150_000_000
@@ -98,6 +101,7 @@ class LogWriter:
         clock_ns: Callable[[], int],
         *,
         keeps_part: bool = True,
+        waits_for_disk: bool = True,
     ) -> None:
         """Store the arguments.
 
@@ -107,6 +111,8 @@ class LogWriter:
             joint_position: converts motor counts to joint positions [rad or m], for /joint_states.
             clock_ns: monotonic clock, for the flush by wall time.
             keeps_part: whether an error leaves the `.part`.
+            waits_for_disk: whether a flush returns once the system has what was flushed. A recorder
+                does not wait: a thread writes (`QueuedFile`).
         """
         self.path = path
         self.part = path.with_name(path.name + UNFINISHED)
@@ -114,6 +120,8 @@ class LogWriter:
         self._joint_position = joint_position
         self._clock_ns = clock_ns
         self._keeps_part = keeps_part
+        self._waits_for_disk = waits_for_disk
+        self._queued: QueuedFile | None = None
         self._axes = len(content.readback.axes)
         self._layout = sample_struct(self._axes)
         self._prefix = joint_state_prefix(content.joint_names)
@@ -139,7 +147,7 @@ class LogWriter:
                 remedy="choose another name, or move it away",
             )
         try:
-            self._stream: BufferedWriter = self.part.open("xb")
+            self._stream = self._new_part()
         except FileExistsError as error:
             raise UsageError(
                 str(self.part),
@@ -160,6 +168,19 @@ class LogWriter:
             self.part.unlink(missing_ok=True)
             raise self._failed(error) from error
         return self
+
+    def _new_part(self) -> BufferedWriter:
+        if self._waits_for_disk:
+            return self.part.open("xb")
+        self._queued = QueuedFile(self.part)
+        return BufferedWriter(self._queued)
+
+    @property
+    def longest_wait_s(self) -> float:
+        """Longest time that the disk has taken for a part of the log [s]; 0 where `write` waits."""
+        if self._queued is None:
+            return 0.0
+        return self._queued.longest_wait_s
 
     def write(self, sample: Sample) -> None:
         """Append one sample.
@@ -256,7 +277,7 @@ class LogWriter:
         )
 
     def flush(self) -> None:
-        """Write everything to the file.
+        """Write everything to the file, or give it to the thread that does.
 
         Samples get chunks of their own, so that a reader takes a whole chunk at once; the rest
         follows in another.
@@ -285,6 +306,8 @@ class LogWriter:
                 self._mcap.add_metadata(STATISTICS, sealed(statistics_record(self.statistics)))
                 self._mcap.finish()
                 self._stream.flush()
+                if self._queued is not None:
+                    self._queued.drain()
                 os.fsync(self._stream.fileno())
             self._take_name()
             fsync_folder(self.path.parent)

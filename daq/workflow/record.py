@@ -77,6 +77,7 @@ LATE_LOSSES_S = 0.25
 the interface's counters are read five times a second (capture.py).
 """
 SPACE_CHECK_S = 0.1  #: Recorded time between two checks of the free space on the disk
+SLOW_DISK_S = 1.0  #: Longest time for which a part of the log may wait for the disk unremarked
 ROUNDING = 1.001  #: Factor by which rounding to whole counts may exceed a limit
 
 
@@ -236,7 +237,13 @@ def record(
         require_released()
         run = _run_info(request, rate_hz, clocks)
         content = LogContent.of(cell, run, files, readback)
-        with LogWriter(out, content, scale.joint_position_of, clocks.monotonic_ns) as log:
+        with LogWriter(
+            out,
+            content,
+            scale.joint_position_of,
+            clocks.monotonic_ns,
+            waits_for_disk=False,
+        ) as log:
             kept = LogAndFeed(
                 log,
                 feed or Feed(request.cell_file),
@@ -266,10 +273,27 @@ def record(
         kept.feed.finish()
         if short is not None:
             raise short
-        if other := network.other_master():
-            warnings.append(f"{other}; it only read, but end that program before the next run")
-        warnings += (*remarks, *recovered, *around, *polling.remarks)
+        warnings += (*_other_master(network), *remarks, *recovered, *around, *polling.remarks)
+        warnings += _slow_disk(out, log.longest_wait_s)
         return Recorded(out, log.statistics, stream.statistics, tuple(warnings))
+
+
+def _other_master(network: CanopenNetwork) -> tuple[str, ...]:
+    """Return who else spoke on the bus as a master does, if one did."""
+    other = network.other_master()
+    if not other:
+        return ()
+    return (f"{other}; it only read, but end that program before the next run",)
+
+
+def _slow_disk(out: Path, longest_wait_s: float) -> tuple[str, ...]:
+    """Return what a disk that took long to take the log cost, if it did."""
+    if longest_wait_s <= SLOW_DISK_S:
+        return ()
+    return (
+        f"the disk of {out} took {longest_wait_s:.1f} s for a part of the log. No sample is lost, "
+        "but a recorder killed at that time would have lost as much: record onto a faster disk",
+    )
 
 
 def _run_info(request: RecordingRequest, rate_hz: float, clocks: Clocks) -> RunInfo:

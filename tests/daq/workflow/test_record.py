@@ -6,7 +6,10 @@ from __future__ import annotations
 
 import gc
 import json
+import os
+import time
 from collections.abc import Callable, Iterable
+from functools import partial
 from math import radians
 from pathlib import Path
 
@@ -17,8 +20,9 @@ import pytest
 from daq.cli.app import main
 from daq.config.cell import Cell
 from daq.config.cell_file import bundle, load_cell
-from daq.errors import ExitCode, RunInvalid
+from daq.errors import ExitCode, OutputFailed, RunInvalid
 from daq.log.conversion import load_run
+from daq.log.queued_file import QueuedFile
 from daq.log.reader import read_log
 from daq.log.salvage import salvage
 from daq.workflow.plan import load_plan
@@ -403,3 +407,45 @@ def test_another_master_that_reads_meanwhile_is_named_at_the_end(lockstep: Rig) 
         "another master was on the bus: an SDO request to J2 (node 2) (602h); it only read, but "
         "end that program before the next run"
     ]
+
+
+def test_a_disk_that_takes_nothing_for_200_cycles_costs_none_of_them(
+    lockstep: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A recorder that waited for this disk would wait for itself."""
+    now_s = 0.0
+    stalled_cycles = []
+
+    def write_late(descriptor: int, data: memoryview) -> int:
+        nonlocal now_s
+        given_up_s = time.monotonic() + 60.0
+        while lockstep.bus.cycle < 200 and time.monotonic() < given_up_s:
+            time.sleep(0.001)
+        stalled_cycles.append(lockstep.bus.cycle)
+        now_s = 1.2
+        return os.write(descriptor, data)
+
+    slow_file = partial(QueuedFile, write=write_late, clock_s=lambda: now_s)
+    monkeypatch.setattr("daq.log.writer.QueuedFile", slow_file)
+    done = lockstep.run()
+    assert stalled_cycles[0] >= 200
+    assert (done.log.valid, done.log.lost_cycles) == (True, 0)
+    samples = read_log(done.path).samples
+    assert samples.cycle.tolist() == list(range(len(samples.cycle)))
+    texts = [text for text in done.warnings if "the disk of" in text]
+    assert len(texts) == 1
+    assert "took 1.2 s for a part of the log" in texts[0]
+
+
+def test_a_disk_that_refuses_ends_the_recording_with_its_reason(
+    lockstep: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse_later(descriptor: int, data: memoryview) -> int:
+        if lockstep.bus.cycle > 100:
+            raise OSError(28, os.strerror(28))
+        return os.write(descriptor, data)
+
+    monkeypatch.setattr("daq.log.writer.QueuedFile", partial(QueuedFile, write=refuse_later))
+    with pytest.raises(OutputFailed, match="no space left"):
+        lockstep.run()
+    assert lockstep.out.with_name("a.mcap.part").exists()
