@@ -45,6 +45,8 @@ from daq.workflow.safeguards import (
     defer_full_gc,
     free_bytes,
     largest_log_bytes,
+    real_time_priority,
+    switch_threads_soon,
 )
 from drivers.canopen.bus import BusAddress
 from drivers.canopen.network import CanopenNetwork, SignalBlocker
@@ -206,6 +208,8 @@ def record(
     require_released()
     with (
         defer_full_gc(),
+        switch_threads_soon(),
+        real_time_priority(),
         network_of(cell, block_signals) as network,
         _sync_producer(cell, network) as wanted,
     ):

@@ -7,6 +7,8 @@ from __future__ import annotations
 import gc
 import json
 import os
+import sys
+import threading
 import time
 from collections.abc import Callable, Iterable
 from functools import partial
@@ -27,7 +29,7 @@ from daq.log.reader import read_log
 from daq.log.salvage import salvage
 from daq.workflow.plan import load_plan
 from daq.workflow.record import LATE_LOSSES_S, Clocks, Recorded, RecordingRequest, record
-from daq.workflow.safeguards import NEVER
+from daq.workflow.safeguards import NEVER, SWITCH_S, real_time_priority
 from drivers.canopen.network import CanopenNetwork, SignalBlocker
 from drivers.canopen.socketcan import Losses
 from drivers.errors import MotionRefused, NodeMisplaced, SampleLost
@@ -407,6 +409,52 @@ def test_another_master_that_reads_meanwhile_is_named_at_the_end(lockstep: Rig) 
         "another master was on the bus: an SDO request to J2 (node 2) (602h); it only read, but "
         "end that program before the next run"
     ]
+
+
+def test_threads_switch_soon_while_a_recording_runs(lockstep: Rig) -> None:
+    before_s = sys.getswitchinterval()
+    found_s = []
+    lockstep.bus.on_cycle = lambda _cycle: found_s.append(sys.getswitchinterval())
+    lockstep.run()
+    assert max(found_s) == pytest.approx(SWITCH_S)
+    assert before_s > SWITCH_S
+    assert sys.getswitchinterval() == before_s
+
+
+def _policy() -> int:
+    return os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK
+
+
+def test_a_recording_has_real_time_priority_where_that_is_permitted(lockstep: Rig) -> None:
+    try:
+        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
+    except PermissionError:
+        pytest.skip("this user may have no real-time priority")
+    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    found: set[int] = set()
+    inherited: set[int] = set()
+
+    def look(_cycle: int) -> None:
+        found.add(_policy())
+        if not inherited:
+            started = threading.Thread(target=lambda: inherited.add(_policy()))
+            started.start()
+            started.join()
+
+    lockstep.bus.on_cycle = look
+    lockstep.run()
+    assert found == {os.SCHED_RR}
+    assert inherited == {os.SCHED_OTHER}
+    assert _policy() == os.SCHED_OTHER
+
+
+def test_a_recording_has_real_time_priority_after_another_one() -> None:
+    """A session records block after block in one process."""
+    policies = []
+    for _ in range(2):
+        with real_time_priority():
+            policies.append(_policy())
+    assert policies[0] == policies[1]
 
 
 def test_a_disk_that_takes_nothing_for_200_cycles_costs_none_of_them(
