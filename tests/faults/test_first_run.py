@@ -62,6 +62,7 @@ def recorded(folder: Path, speed: float) -> tuple[Path, list[list[int]]]:
     return out, reported
 
 
+@pytest.mark.slow
 def test_a_first_run_is_slower_in_speed_and_ramps_and_its_log_says_so(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -142,6 +142,7 @@ STOPS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", STOPS)
 def test_a_fault_is_named_logged_in_time_and_stops_all_axes(name: str) -> None:
     promise = STOPS[name]

@@ -53,6 +53,7 @@ def searched(
     return found, ident.find_effects(evidence, rng, families=families)
 
 
+@pytest.mark.slow
 def test_what_is_left_of_the_currents_is_that_of_the_held_out_rows(
     searched: tuple[ident.Identification, tuple[ident.Step, ...]],
 ) -> None:

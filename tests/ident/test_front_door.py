@@ -473,6 +473,7 @@ def test_exchanged_currents_name_the_function_that_tests_their_order(
         assert named is not None
 
 
+@pytest.mark.slow
 def test_held_out_runs_judge_the_effects_of_a_library_user(example: SimpleNamespace) -> None:
     """As on the command line: what they do not confirm is not in the calibration."""
     found = example.main()

@@ -746,6 +746,7 @@ def test_a_link_of_one_s_own_is_followed_and_history_and_audit_name_the_file_beh
     assert main(["history", str(bench.cell), "--verify"]) == ExitCode.OK
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("closed", [False, True], ids=["full disk", "closed pipe"])
 def test_an_output_that_fails_after_a_write_says_what_was_written(
     bench: Bench, closed: bool
@@ -777,6 +778,7 @@ def test_an_output_that_fails_after_a_write_says_what_was_written(
         assert not re.search("nothing was|another folder|Traceback|Exception", done.stderr)
 
 
+@pytest.mark.slow
 def test_a_report_that_nobody_can_read_is_no_report_of_a_write(bench: Bench) -> None:
     before = bench.controller.read_bytes()
     arguments = ["apply", str(bench.calibration), "--yes", "--json", "--cell", str(bench.cell)]
@@ -939,6 +941,7 @@ def test_an_audit_in_no_folder_is_named(bench: Bench, capsys: pytest.CaptureFixt
     assert bench.controller.read_bytes() == before
 
 
+@pytest.mark.slow
 def test_a_terminal_without_greek_letters_gets_them_spelled_out(bench: Bench) -> None:
     file = bench.controller.with_name("é😀.yaml")
     bench.controller.rename(file)

@@ -344,6 +344,7 @@ def test_a_new_cell_file_is_edited_first_unless_it_is_of_the_simulated_cell(
     assert next_step(last) == "scan"
 
 
+@pytest.mark.slow
 def test_a_replaced_file_is_named_and_an_unrelated_one_is_not(
     cell: Cell, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -84,6 +84,7 @@ def test_the_part_of_a_cell_file_can_be_pasted() -> None:
     }
 
 
+@pytest.mark.slow
 def test_a_mechanism_that_does_not_close_is_refused_with_its_file(
     checkout: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

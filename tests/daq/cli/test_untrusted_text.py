@@ -39,6 +39,7 @@ def test_a_formula_is_text_to_a_spreadsheet(text: str) -> None:
     assert inert(text) == "'" + text.replace("\r", "\n")
 
 
+@pytest.mark.slow
 @given(st.text() | st.floats() | st.none())
 def test_a_cell_is_what_it_was_but_for_an_apostrophe(value: object) -> None:
     shown = inert(value)

@@ -4,6 +4,7 @@ from.
 
 from __future__ import annotations
 
+import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -11,6 +12,7 @@ from tests.daq.config.data_sheet import data_sheet
 from tests.daq.config.odd_sheets import NODE_IDS, Entry, dictionaries, sheets
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=150, suppress_health_check=[HealthCheck.too_slow])
 @given(st.data())
 def test_an_odd_sheet_gives_the_dictionary_that_it_was_written_from(data: st.DataObject) -> None:

@@ -40,6 +40,7 @@ def path(tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.slow
 @settings(max_examples=150, deadline=None)
 @given(calibrations)
 def test_every_calibration_comes_back_as_it_was_written(calibration: Calibration) -> None:

@@ -468,6 +468,7 @@ def test_xml_that_is_not_safe_or_none_is_refused(content: bytes, says: str) -> N
     assert says in str(caught.value)
 
 
+@pytest.mark.slow
 def test_deep_and_wide_xml_takes_no_recursion() -> None:
     deep = b"<R><G>1.5</G>" + b"<a>" * 20_000 + b"</a>" * 20_000 + b"<b/>" * 20_000 + b"</R>"
     content = decode_document(deep, "robot.xml").with_values({"R/G": "2.5000"}).content

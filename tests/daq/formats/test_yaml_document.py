@@ -19,6 +19,7 @@ from daq.formats.yaml_document import YamlDocument, yaml_document
 from tests.daq.formats.yaml_cases import NUMBERS, Case, cases
 
 
+@pytest.mark.slow
 @settings(max_examples=200, deadline=None)
 @given(cases(), st.data())
 def test_only_theNUMBERS_meant_change(case: Case, data: st.DataObject) -> None:

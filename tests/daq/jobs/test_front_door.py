@@ -45,6 +45,7 @@ def test_importing_it_loads_nothing() -> None:
     assert done.stdout.strip() == "[]"
 
 
+@pytest.mark.slow
 def test_the_documented_lines_write_the_gains(
     whole_job: tuple[Rig, Made],
     tmp_path: Path,

@@ -600,6 +600,7 @@ def test_the_table_leaves_as_csv(cell: Path, capsys: pytest.CaptureFixture[str])
     assert cell.read_bytes().startswith(b"#") or b"axes" in cell.read_bytes()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".png", ".svg"])
 @pytest.mark.parametrize("arguments", [[], ["--axis", "J4"]])
 def test_the_picture_is_drawn_the_same_each_time(

@@ -252,6 +252,7 @@ def _write_on(folder: Path, week: int, written: Any, begun: Any) -> None:
         written.value += 1
 
 
+@pytest.mark.slow
 def test_a_writer_killed_at_any_moment_leaves_a_whole_history(tmp_path: Path) -> None:
     """Ended writes are there, others are not, and none is half."""
     rng = random.Random(7)

@@ -309,6 +309,7 @@ def test_sessions_get_the_new_name_unless_they_began_after_the_rename(tmp_path: 
     assert len(sessions(tmp_path, "gantry")) == 1
 
 
+@pytest.mark.slow
 def test_a_rename_that_is_killed_at_any_system_call_is_completed_by_the_next_one(
     tmp_path: Path,
 ) -> None:

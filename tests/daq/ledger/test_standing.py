@@ -176,6 +176,7 @@ def test_an_entry_that_was_edited_accepts_nothing(ledger: Ledger) -> None:
     assert standing.history.may_lack
 
 
+@pytest.mark.slow
 @given(st.lists(st.tuples(st.sampled_from((FILE, COPY)), st.integers(0, 2)), max_size=8))
 def test_the_last_write_of_each_place_decides(
     tmp_path_factory: pytest.TempPathFactory, steps: list[tuple[str, int]]

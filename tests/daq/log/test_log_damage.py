@@ -42,6 +42,7 @@ def _same(one: Log, other: Log) -> bool:
     return heads and all(np.array_equal(a, b) for a, b in pairs)
 
 
+@pytest.mark.slow
 def test_no_flipped_bit_gives_other_data(good: Path, tmp_path: Path) -> None:
     original = read_log(good)
     data = good.read_bytes()

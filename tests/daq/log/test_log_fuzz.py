@@ -99,6 +99,7 @@ DAMAGE = st.lists(
 )
 
 
+@pytest.mark.slow
 @settings(FUZZ, max_examples=200)
 @given(DAMAGE)
 def test_no_damage_gives_other_numbers(

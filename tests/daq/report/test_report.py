@@ -249,6 +249,7 @@ def test_a_torque_of_the_drive_is_questioned_only_beyond_its_noise() -> None:
     assert list(torque_sentences(slopes[:1], gains[:1])) == []
 
 
+@pytest.mark.slow
 def test_pictures_need_no_screen_and_no_global_state() -> None:
     modules = "daq.report.plots, daq.report.plots, daq.report.gains"
     code = f"import sys, {modules}; print('matplotlib.pyplot' in sys.modules)"

@@ -189,6 +189,7 @@ def closed(shelved: Shelf) -> Closed:
     return Closed(changed_fitted, account(start, steps))
 
 
+@pytest.mark.slow
 def test_an_axis_that_rests_in_the_held_out_runs_has_the_error_of_moves_left_out(
     closed: Closed,
 ) -> None:
@@ -894,6 +895,7 @@ def test_the_kind_of_the_errors_is_said_where_several_motors_act_on_a_joint(clos
     assert said.endswith("differ where several motors act on a joint (J5).")
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
 def test_silence_is_reported_with_its_size(closed: Closed) -> None:
     last = closed.fitted.steps[-1]
@@ -1070,6 +1072,7 @@ def test_what_did_not_join_is_reported_with_the_reason(closed: Closed) -> None:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
 def test_effects_that_held_out_runs_refute_are_not_written(
     closed: Closed,

@@ -407,6 +407,7 @@ def _calls(tree: ast.AST) -> set[str]:
     }
 
 
+@pytest.mark.slow
 def test_every_function_that_makes_a_table_has_an_example(checkout: Path) -> None:
     makers = set()
     others = set()

@@ -228,6 +228,7 @@ def test_a_joint_that_follows_another_is_refused_and_not_simulated_as_a_free_one
     assert "closures" in caught.value.expected
 
 
+@pytest.mark.slow
 def test_only_simulate_and_demo_import_the_truth(checkout: Path) -> None:
     importers = set()
     for room in ("daq", "ident", "drivers"):

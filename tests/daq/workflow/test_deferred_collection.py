@@ -17,6 +17,7 @@ class Ring:
         self.itself = self
 
 
+@pytest.mark.slow
 def test_full_collections_are_deferred_and_young_ones_are_not() -> None:
     collected: list[int] = []
 

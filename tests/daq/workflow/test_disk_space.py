@@ -110,6 +110,7 @@ def test_a_disk_that_fills_up_ends_the_run_in_a_controlled_way(
         load_run(rig.out)
 
 
+@pytest.mark.slow
 def test_an_axis_that_does_not_stop_then_is_reported(
     checkout: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -150,6 +150,7 @@ def truth_runs() -> dict[str, Run]:
     return {run.name: replace(run, digest=f"{index:064x}") for index, run in enumerate(made)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("nameplate_is_true", [False, True])
 def test_a_hold_out_is_distinguished_better_than_by_a_wrong_nameplate_and_no_worse_than_by_a_true_one(  # noqa: E501
     truth_runs: dict[str, Run], monkeypatch: pytest.MonkeyPatch, nameplate_is_true: bool
@@ -276,6 +277,7 @@ def test_one_wrong_gain_among_good_ones_is_refused_in_spite_of_an_effect(with_ef
     assert gates == {Gate.HOLDOUT}
 
 
+@pytest.mark.slow
 def test_without_a_hold_out_or_with_fixed_gains_there_is_nothing_to_compare(
     truth_runs: dict[str, Run], monkeypatch: pytest.MonkeyPatch
 ) -> None:

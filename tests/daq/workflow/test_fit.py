@@ -92,6 +92,7 @@ def test_logs_become_sources_with_their_roles(
     assert found.identification.holdout_error is not None
 
 
+@pytest.mark.slow
 def test_the_log_that_contradicts_the_others_is_named(
     shelf: Shelf, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -139,6 +140,7 @@ def test_a_cut_off_beyond_the_sampling_rate_is_named_by_its_key(
         fit(logs, cell=cell)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", [Method.LS, Method.WLS, Method.TLS])
 def test_every_method_hears_of_a_payload_that_was_not_there(
     shelf: Shelf, monkeypatch: pytest.MonkeyPatch, method: Method
@@ -154,6 +156,7 @@ def moves_in(found: Fit) -> int:
     return len(found.identification.system.clusters)
 
 
+@pytest.mark.slow
 def test_a_sigma_of_few_moves_is_said_to_be_rough(
     shelf: Shelf, pair: Fit, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -198,6 +201,7 @@ def test_an_axis_that_did_not_move_has_a_dash_and_no_number(
     assert held_out == expected
 
 
+@pytest.mark.slow
 def test_the_drives_own_torque_is_shown_beside_the_gains_and_changes_none(
     shelf: Shelf, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -49,6 +49,7 @@ def shelf(cell: Cell) -> Shelf:
     return Shelf(cell, runs)
 
 
+@pytest.mark.slow
 def test_gains_are_true_and_the_calibration_predicts_with_the_friction_of_the_payload(
     shelf: Shelf, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

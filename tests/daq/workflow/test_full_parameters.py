@@ -82,6 +82,7 @@ def test_every_parameter_of_the_real_robot_has_a_value_a_sigma_and_a_basis(
     assert median_absolute_difference < 1.0
 
 
+@pytest.mark.slow
 def test_masses_that_are_wrong_are_said(fitted: Fit, urdf: str) -> None:
     heavy = full_set(fitted, _scaled(urdf, 1.5), "heavy.urdf", 0.1)
     assert heavy.contradictions[0].startswith("by the data, the links together are 0.")

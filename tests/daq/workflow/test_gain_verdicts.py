@@ -44,6 +44,7 @@ def fitted() -> Iterator[Fit]:
         yield fit(logs)
 
 
+@pytest.mark.slow
 def test_the_deviations_are_the_fits_own_and_weak_gains_get_advice(fitted: Fit) -> None:
     estimate = fitted.identification.estimate
     found = gain_verdicts(fitted)

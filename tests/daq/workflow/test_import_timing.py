@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from daq.config.import_description import TimeColumn, TimeUnit
 from daq.log.resampling import clock_of
@@ -55,6 +56,7 @@ def _resampled(run: Run, table: Table) -> Run:
     return replace(run, time_s=clock.tick_s, position_rad=position_rad, current_a=current_a)
 
 
+@pytest.mark.slow
 def test_jittered_stamps_cost_at_most_a_fifth_of_the_accuracy() -> None:
     """Random steps of 10 and 12 ms against 11 ms:
     the same motions, and noise of the same size, over several seeds.

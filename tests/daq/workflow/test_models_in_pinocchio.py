@@ -62,6 +62,7 @@ def _rigid_nm(model: Any, robot: CalibratedRobot, tree: Motion) -> FloatArray:
     return np.array(torques).T
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", ["kr270", "seven-axis", "gantry", "ur10", "five-bar", "orthoglide", "dualv"]
 )

@@ -216,6 +216,7 @@ def test_a_declared_workspace_is_the_room_without_a_second_one(
     assert found.scene(scene) is scene
 
 
+@pytest.mark.slow
 def test_the_plan_and_its_page_say_what_they_were_planned_for(
     experiment: Experiment, aimed: tuple[Plan, ...], tmp_path: Path
 ) -> None:

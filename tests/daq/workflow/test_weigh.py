@@ -88,6 +88,7 @@ def test_a_real_flange_without_a_body_weighs_nothing(
     assert document["part_of_the_fit"] == ["tx40"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("verb", ["weigh", "contact"])
 def test_a_cell_that_was_corrected_since_is_not_corrected_twice_unsaid(
     real: tuple[Path, Path], tmp_path: Path, verb: str, caplog: pytest.LogCaptureFixture
@@ -112,6 +113,7 @@ def test_a_cell_that_was_corrected_since_is_not_corrected_twice_unsaid(
         assert all(f"zero-offset on {axis}" in text for text in texts)
 
 
+@pytest.mark.slow
 def test_a_calibration_comes_first_or_as_an_option(
     real: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
 ) -> None:

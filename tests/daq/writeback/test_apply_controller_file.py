@@ -9,6 +9,7 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -22,6 +23,7 @@ from tests.daq.calibrations import demo_calibration, of_first_axes
 from tests.daq.formats.yaml_cases import Case, cases
 
 
+@pytest.mark.slow
 @settings(max_examples=150, deadline=None)
 @given(cases(), st.data())
 def test_of_a_file_on_the_disk_nothing_but_the_gains_changes(

@@ -340,6 +340,7 @@ def test_a_drive_that_falls_silent_is_named_and_the_others_are_put_back(
         assert _saved(simulation) == IN_DRIVES
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("made", [False, True], ids=["aborted", "answer lost"])
 def test_whichever_transfer_fails_the_old_values_stay_everywhere(
     address: BusAddress, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, made: bool

@@ -260,6 +260,7 @@ def _is_reached(place: Place, state: State, _call: int) -> bool:
     return place.state() == state
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("ci", "ends"), [("", pytest.skip.Exception), ("true", pytest.fail.Exception)]
 )

@@ -77,6 +77,7 @@ def controller_of(cell: Path) -> Path:
     return path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lasting", [False, True], ids=["once", "from then on"])
 @pytest.mark.parametrize("verb", ["apply", "rollback"])
 def test_no_message_denies_a_write_and_the_next_command_enters_it(

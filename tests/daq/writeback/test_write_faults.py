@@ -311,6 +311,7 @@ def _row(verb: str, number: int) -> FaultRow:
     return FaultRow(verb, number, "rename", "controller's file", KILL, False, -1, "old", (), ())
 
 
+@pytest.mark.slow
 def test_a_part_of_the_study_keeps_the_rows_of_the_other_verbs(tmp_path: Path) -> None:
     table = tmp_path / "rows.csv"
     earlier = (_row("apply", 1), _row("rollback", 1), _row("calibrate", 1))

@@ -295,6 +295,7 @@ def test_no_line_of_one_client_reaches_or_ends_another(line: bytes) -> None:
             end.shutdown()
 
 
+@pytest.mark.slow
 @settings(
     max_examples=150,
     deadline=None,

@@ -203,6 +203,7 @@ def test_what_a_killed_recorder_left_under_another_id_is_used_again() -> None:
     assert bus.nodes[0].value(0x1016, 1) == 0
 
 
+@pytest.mark.slow
 def test_a_device_with_any_node_id_leaves_the_recorder_an_id_of_its_own_or_the_run_is_refused() -> (
     None
 ):

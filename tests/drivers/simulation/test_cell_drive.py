@@ -85,6 +85,7 @@ def settings(network: CanopenNetwork) -> list[tuple[bytes, ...]]:
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("cell")
 def test_scan_prepare_move_and_give_back(address: BusAddress, axes: tuple[Axis, ...]) -> None:
     events: list[CellEvent] = []

@@ -33,6 +33,7 @@ def pose(plant: Plant, along: FloatArray, size: float) -> FloatArray:
     )[:n]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("payload", [False, True])
 @pytest.mark.parametrize("name", ROBOTS)
 def test_moves_are_reached_and_the_loops_stay_closed(

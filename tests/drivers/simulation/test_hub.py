@@ -51,6 +51,7 @@ def frame(number: int) -> can.Message:
     return can.Message(arbitration_id=number, is_extended_id=False, data=b"\x2a")
 
 
+@pytest.mark.slow
 def test_a_client_that_sends_without_end_waits_for_the_cell_and_no_frame_is_lost() -> None:
     """20 MB from one client disconnected the cell itself after 8 MB:
     `simulate` ended with exit code 5.
@@ -112,6 +113,7 @@ def test_a_deaf_client_that_is_answered_holds_up_nobody_and_fills_no_output(
     assert caplog.messages == []
 
 
+@pytest.mark.slow
 def test_a_deaf_client_is_disconnected_and_the_others_hear_everything(
     caplog: pytest.LogCaptureFixture,
 ) -> None:

@@ -364,6 +364,7 @@ def test_a_timed_cycle_does_not_wait_beyond_its_period(timed: Prepared) -> None:
     assert time_ns == [PERIOD_NS * k for k in range(5)]
 
 
+@pytest.mark.slow
 @settings(deadline=None)
 @given(st.sets(st.tuples(st.integers(0, 29), st.sampled_from((0x181, 0x182))), max_size=12))
 def test_every_dropped_frame_is_exactly_one_bit(dropped: set[tuple[int, int]]) -> None:
@@ -768,6 +769,7 @@ def test_the_kernels_sync_never_comes_from_the_wire(followed: Followed) -> None:
         next(stream)
 
 
+@pytest.mark.slow
 @settings(deadline=None)
 @given(st.sets(st.tuples(st.integers(0, 29), st.sampled_from((0x181, 0x182))), max_size=12))
 def test_after_an_answer_dropped_from_a_followed_cycle_the_next_is_doubtful(

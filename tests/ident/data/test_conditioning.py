@@ -42,6 +42,7 @@ def test_each_row_is_its_whole_window_weighted(
         assert rows[:, row] == pytest.approx(window @ filter_.taps, abs=1e-12)
 
 
+@pytest.mark.slow
 @settings(max_examples=20, deadline=None)
 @given(
     rate_hz=st.sampled_from((250.0, 999.0, 1000.0, 5000.0)),

@@ -141,6 +141,7 @@ def test_a_fit_of_held_readings_has_the_same_gains_and_says_so(runs: list[Run]) 
     assert gains == pytest.approx(TRUTH.gains, rel=0.03)
 
 
+@pytest.mark.slow
 def test_positions_of_a_real_arm_that_are_held_for_10_ms_cost_little(shared_data: Path) -> None:
     """The error of its six axes is 5.05 %, and was 5.63 % with these positions.
 

@@ -51,6 +51,7 @@ def lagging(run: Run, cutoff_hz: float) -> Run:
     return replace(run, current_a=filtered)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", [2, 4])
 def test_a_filter_without_phase_is_found_with_its_cut_off_and_order(order: int) -> None:
     found = _found(lambda run: without_phase(run, 2.0, order))
@@ -61,6 +62,7 @@ def test_a_filter_without_phase_is_found_with_its_cut_off_and_order(order: int) 
     assert found.fallen_share > 0.5
 
 
+@pytest.mark.slow
 def test_a_causal_filter_of_first_order_is_found_as_one() -> None:
     found = _found(lambda run: lagging(run, 2.0))
     assert found is not None
@@ -68,6 +70,7 @@ def test_a_causal_filter_of_first_order_is_found_as_one() -> None:
     assert abs(found.cutoff_hz - 2.0) < max(3.0 * found.cutoff_std_hz, 0.02)
 
 
+@pytest.mark.slow
 def test_gains_behind_a_filter_are_right_once_it_is_in_the_model() -> None:
     runs = _recorded(lambda run: without_phase(run, 2.0, 3))
     evidence = gathered(TRUTH, runs)
@@ -124,6 +127,7 @@ def test_friction_that_the_model_lacks_is_no_filter() -> None:
     assert find_current_filter(bent(clean, TRUTH, torque_nm)) is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "expected_hz"), [("ur10", 1.74), ("tx40", 0.0), ("kr300-A", 0.0)])
 def test_of_real_recordings_the_ur10_alone_has_filtered_currents(
     shared_data: Path, name: str, expected_hz: float

@@ -18,6 +18,7 @@ AXES = ("J1", "J2", "J3")
 OFF_DEG = 5.0
 
 
+@pytest.mark.slow
 def test_a_zero_of_some_degrees_is_seen_by_the_search_alone(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

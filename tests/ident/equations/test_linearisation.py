@@ -113,6 +113,7 @@ def test_the_triangle_of_rows_has_their_jacobian(truth: Truth) -> None:
     assert products[0] == pytest.approx(products[1], abs=1e-10 * np.abs(products[0]).max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("has_instruments", [False, True])
 def test_sums_of_clusters_are_those_of_each_clusters_own_rows(
     noisy: Evidence, has_instruments: bool

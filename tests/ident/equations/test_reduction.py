@@ -72,6 +72,7 @@ def small_estimate(small_truth: Truth, small_runs: tuple[Run, ...]) -> Estimate:
     return ml(regrouped(standard))
 
 
+@pytest.mark.slow
 @given(st.integers(min_value=1, max_value=400))
 @settings(max_examples=6, deadline=None)
 def test_results_do_not_depend_on_the_chunk(

@@ -30,6 +30,7 @@ def _robot_std_percent(found: Essential) -> np.ndarray[tuple[int], np.dtype[np.f
     return relative_std_percent(found.estimate.parameters, found.estimate.parameters_std)[:robot]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("estimator", ESTIMATORS)
 @pytest.mark.parametrize("ratio", [10.0, 30.0])
 def test_the_spread_of_what_stays_is_below_the_ratio(

@@ -105,6 +105,7 @@ def _is_unknown(found: QuickGains, reason: Unknown, axes: tuple[int, ...] = ()) 
 # The same as all rows at once
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=12)
 @given(order=st.permutations(range(8)))
 def test_pieces_in_any_order_give_the_gains_of_all_rows_at_once(
@@ -117,6 +118,7 @@ def test_pieces_in_any_order_give_the_gains_of_all_rows_at_once(
     assert _std(found) == pytest.approx(_std(at_once), rel=0.3)
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=12)
 @given(lengths=st.lists(st.integers(3, LONG_SAMPLES - 1), max_size=6))
 def test_runs_that_were_folded_in_while_they_grew_are_the_whole_runs(

@@ -67,6 +67,7 @@ def test_iv_solves_the_equations_of_its_instruments(disturbed: tuple[Identificat
     assert np.all(np.abs(columns) < 1e-2 * size)
 
 
+@pytest.mark.slow
 def test_the_loop_bends_ml_and_not_iv(small_truth: Truth) -> None:
     """Mean z of friction over some cells: four σ off by ``ml``, none by ``iv``."""
     z: dict[str, list[list[float]]] = {"ml": [], "iv": []}

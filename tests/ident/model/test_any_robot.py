@@ -202,6 +202,7 @@ def test_without_noise_the_gains_are_exact(kind: Kind, gravity: Gravity) -> None
         assert found == pytest.approx(payload[LINK_PARAMETERS.index(name)], rel=1e-4, abs=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS, ids=_name)
 @settings(deadline=None, max_examples=3)
 @given(data=st.data())

@@ -468,6 +468,7 @@ def test_the_planar_platform_is_where_its_legs_hold_it() -> None:
     assert turned["motor-0"] + turned["elbow-0"] + turned["platform"] == pytest.approx(0.2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mechanism", MECHANISMS, ids=lambda one: one.name)
 def test_every_pose_of_a_recording_is_reached_from_the_assembly_pose(mechanism: Mechanism) -> None:
     """Also when they are asked one by one, far from each other, as a planner does."""

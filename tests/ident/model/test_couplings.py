@@ -241,6 +241,7 @@ def test_a_follower_is_no_place_of_an_effect() -> None:
     assert position_rad.shape == (4, 3)
 
 
+@pytest.mark.slow
 def test_a_spring_on_a_follower_is_found_as_one_of_its_axis(recordings: tuple[Run, ...]) -> None:
     """The search works on the motion of the axes, in which the follower has no place."""
     stiffness_nm_rad = 30.0

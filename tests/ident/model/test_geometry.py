@@ -63,6 +63,7 @@ def test_a_zero_is_added_to_the_recorded_positions(mechanism: Mechanism) -> None
         assert_allclose(found.rotation, expected.rotation, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_length_moves_the_other_end_of_its_link_along_itself() -> None:
     for parameter in geometry_parameters(PLANAR.robot):
         if parameter.kind is GeometryKind.LENGTH:

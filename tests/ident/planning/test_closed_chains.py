@@ -47,6 +47,7 @@ def _design(mechanism: Mechanism, made: Made, noise_a: FloatArray) -> Design:
     return Design(expectation, base)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mechanism", [FIVE_BAR, PLANAR], ids=lambda one: one.name)
 def test_the_predicted_deviation_is_that_of_a_fit(mechanism: Mechanism) -> None:
     made = made_of(mechanism, 3, seconds=18.0, noise_a=NOISE_A, preload_nm=0.0)
@@ -126,6 +127,7 @@ def _spread_with_known_preload(rows: Observation, noise_a: FloatArray) -> FloatA
     return np.asarray(100.0 * np.std(found, axis=0) / absolute_gain)
 
 
+@pytest.mark.slow
 def test_preload_hides_gains_while_the_pose_hardly_changes() -> None:
     """A tenth of the workspace: fits with and without knowledge of the preload differ as the
     verdict says.

@@ -89,6 +89,7 @@ def _data(truth: Truth, runs: tuple[Run, ...]) -> list[Dataset]:
     return [differentiate(run, truth.model.drive_train, CONDITIONING) for run in runs]
 
 
+@pytest.mark.slow
 def test_predicted_deviations_are_those_of_the_estimator(truth: Truth) -> None:
     rng = np.random.default_rng(21)
     clean = tuple(

@@ -140,6 +140,7 @@ def _belted(payload: ident.Payload | None) -> tuple[ident.Model, FloatArray]:
     return model, parameters
 
 
+@pytest.mark.slow
 def test_a_robot_with_a_joint_that_follows_an_axis_is_planned_for_with_what_it_carries() -> None:
     """The plan is good for a fit of that robot, and better than random moves."""
     model, _ = _belted(None)
