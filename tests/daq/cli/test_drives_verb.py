@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,7 +18,6 @@ from daq.ledger.audit import AuditAction, read
 from daq.ledger.ledger import Ledger, read_history
 from daq.report.proposal import DriveChange, DriveRollback
 from daq.workflow.bus_lock import bus_lock
-from drivers.canopen.bus import BusAddress
 from drivers.canopen.parameters import Saving
 from drivers.canopen.sdo import ObjectAccess
 from drivers.simulation.cell import SimulatedCell
@@ -29,23 +27,8 @@ from tests.daq.drives import (
     NOW,
     apply_in_drives,
     entered_gain,
-    on_its_own_bus,
     saved_gain,
-    simulated,
 )
-
-
-@pytest.fixture
-def cell(request: pytest.FixtureRequest, tmp_path: Path) -> Cell:
-    return on_its_own_bus(tmp_path, request.node.name)
-
-
-@pytest.fixture
-def simulation(cell: Cell) -> Iterator[SimulatedCell]:
-    channel = cell.buses[0].channel
-    address = BusAddress("virtual", channel)
-    with simulated(address) as running:
-        yield running
 
 
 def _back(cell: Cell, *, yes: bool = True, as_json: bool = False) -> None:
@@ -62,9 +45,9 @@ def _back(cell: Cell, *, yes: bool = True, as_json: bool = False) -> None:
 
 
 def test_look_write_and_go_back(
-    cell: Cell, simulation: SimulatedCell, capsys: pytest.CaptureFixture[str]
+    drive_cell: Cell, simulation: SimulatedCell, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    apply_in_drives(cell)
+    apply_in_drives(drive_cell)
     shown = capsys.readouterr().out
     assert "current gain" in shown
     assert "J4, 2003h:01: -11520 -> -9210" in shown
@@ -72,28 +55,30 @@ def test_look_write_and_go_back(
     assert [entered_gain(node) for node in simulation.nodes] == pytest.approx(NAMEPLATE)
     base = shown.split("--base ")[1].split()[0]
 
-    apply_in_drives(cell, yes=True, base=base)
+    apply_in_drives(drive_cell, yes=True, base=base)
     output = capsys.readouterr().out
     assert "Written to the drives and read back" in output
     assert "To undo: drivegain rollback --cell cells/demo.yaml --drives" in output
     assert [saved_gain(node) for node in simulation.nodes] == pytest.approx(IDENTIFIED)
-    apply_in_drives(cell)
+    apply_in_drives(drive_cell)
     assert "The drives have these gains already" in capsys.readouterr().out
 
-    _back(cell, yes=False)
+    _back(drive_cell, yes=False)
     output = capsys.readouterr().out
     assert "J4, 2003h:01: -9210 -> -11520" in output
     assert "the write of 2025-01-02T03:04:05+00:00 by Kim (login kim)" in output
     assert "Dry run, nothing was written." in output
     assert [saved_gain(node) for node in simulation.nodes] == pytest.approx(IDENTIFIED)
-    _back(cell)
+    _back(drive_cell)
     output = capsys.readouterr().out
     assert "J4, 2003h:01: -9210 -> -11520" in output
     assert "The drives have saved." in output
     assert [saved_gain(node) for node in simulation.nodes] == pytest.approx(NAMEPLATE)
-    assert cell.history is not None
+    assert drive_cell.history is not None
     entered = AuditAction.CALIBRATION_ENTERED
-    assert [(entry.action, entry.who, entry.subject) for entry in read(cell.history.audit)] == [
+    assert [
+        (entry.action, entry.who, entry.subject) for entry in read(drive_cell.history.audit)
+    ] == [
         (
             action,
             "Kim (login kim)",
@@ -107,7 +92,7 @@ def test_look_write_and_go_back(
             AuditAction.ROLLED_BACK,
         )
     ]
-    evidence = read(cell.history.audit)[0].details
+    evidence = read(drive_cell.history.audit)[0].details
     assert evidence["configuration_sha256"] == demo_calibration().configuration_sha256
     expected = {
         "file": str(Path("calibration.yaml").absolute()),
@@ -117,7 +102,7 @@ def test_look_write_and_go_back(
         "software": demo_calibration().software,
     }
     assert evidence["calibration"] == expected
-    ledger = Ledger.of(cell)
+    ledger = Ledger.of(drive_cell)
     assert ledger is not None
     history = read_history(ledger)
     targets = [event.target for event in history.events]
@@ -125,9 +110,9 @@ def test_look_write_and_go_back(
     assert history.in_force() is None
     # The two entries that record how the writes ended.
     assert {event.audit for event in history.events} == {
-        entry.sha256 for entry in read(cell.history.audit)[1::3]
+        entry.sha256 for entry in read(drive_cell.history.audit)[1::3]
     }
-    _back(cell)
+    _back(drive_cell)
     assert (
         read_history(ledger).in_force()
         == hashlib.sha256(encode_calibration(demo_calibration())).hexdigest()
@@ -135,12 +120,12 @@ def test_look_write_and_go_back(
 
 
 @pytest.mark.usefixtures("simulation")
-def test_a_program_gets_all_of_it(cell: Cell, capsys: pytest.CaptureFixture[str]) -> None:
-    apply_in_drives(cell, as_json=True)
+def test_a_program_gets_all_of_it(drive_cell: Cell, capsys: pytest.CaptureFixture[str]) -> None:
+    apply_in_drives(drive_cell, as_json=True)
     reviewed = json.loads(capsys.readouterr().out)
     assert (reviewed["applied"], reviewed["refusals"]) == (False, [])
     assert reviewed["changes"][3]["new"] == -9.21
-    apply_in_drives(cell, as_json=True, yes=True, saving=Saving.RAM)
+    apply_in_drives(drive_cell, as_json=True, yes=True, saving=Saving.RAM)
     text = capsys.readouterr().out
     written = json.loads(text)
     DriveChange.model_validate_json(text)
@@ -148,7 +133,7 @@ def test_a_program_gets_all_of_it(cell: Cell, capsys: pytest.CaptureFixture[str]
     assert written["base_sha256"] == reviewed["base_sha256"]
     assert Path(written["record"]).is_file()
     for yes in (False, True):
-        _back(cell, yes=yes, as_json=True)
+        _back(drive_cell, yes=yes, as_json=True)
         text = capsys.readouterr().out
         document = json.loads(text)
         DriveRollback.model_validate_json(text)
@@ -165,7 +150,7 @@ def test_a_program_gets_all_of_it(cell: Cell, capsys: pytest.CaptureFixture[str]
 @pytest.mark.parametrize("yes", [False, True])
 @pytest.mark.parametrize("as_json", [False, True])
 def test_a_failed_check_is_reported_and_nothing_written(
-    cell: Cell,
+    drive_cell: Cell,
     simulation: SimulatedCell,
     capsys: pytest.CaptureFixture[str],
     yes: bool,
@@ -176,7 +161,7 @@ def test_a_failed_check_is_reported_and_nothing_written(
     gains = (changed_gain, *calibration.gains[1:])
     far = replace(calibration, gains=gains)
     with pytest.raises(CalibrationRefused, match="J1: found σ"):
-        apply_in_drives(cell, calibration=far, yes=yes, as_json=as_json)
+        apply_in_drives(drive_cell, calibration=far, yes=yes, as_json=as_json)
     shown = capsys.readouterr().out
     if as_json:
         refusals = json.loads(shown)["refusals"]
@@ -186,7 +171,7 @@ def test_a_failed_check_is_reported_and_nothing_written(
 
 
 def test_an_interrupt_puts_back_what_was_written(
-    cell: Cell,
+    drive_cell: Cell,
     simulation: SimulatedCell,
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
@@ -205,7 +190,7 @@ def test_an_interrupt_puts_back_what_was_written(
 
     monkeypatch.setattr(ObjectAccess, "read", interrupted)
     with pytest.raises(typer.Exit) as caught:
-        apply_in_drives(cell, yes=True)
+        apply_in_drives(drive_cell, yes=True)
     assert caught.value.exit_code == 130
     assert (
         "interrupted: kept: the previous values are restored in J1, J2, J3"
@@ -214,10 +199,10 @@ def test_an_interrupt_puts_back_what_was_written(
 
 
 @pytest.mark.usefixtures("simulation")
-def test_a_bus_that_another_client_has_is_left_alone(cell: Cell) -> None:
-    with bus_lock(cell), pytest.raises(BusTaken):
-        apply_in_drives(cell)
-    apply_in_drives(cell)
+def test_a_bus_that_another_client_has_is_left_alone(drive_cell: Cell) -> None:
+    with bus_lock(drive_cell), pytest.raises(BusTaken):
+        apply_in_drives(drive_cell)
+    apply_in_drives(drive_cell)
 
 
 def test_the_two_options_of_saving() -> None:

@@ -4,7 +4,6 @@ every verb that reads one refuses it, by the key.
 
 from __future__ import annotations
 
-import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -46,33 +45,23 @@ NONSENSE: dict[str, dict[str, Any]] = {
 }
 
 
-@pytest.fixture
-def cell(tmp_path: Path) -> Path:
-    """The demo cell in a folder of its own."""
-    kept = shutil.ignore_patterns("*.jsonl*", "*.sqlite*")
-    configs_folder = Path(__file__).parents[3] / "configs"
-    shutil.copytree(configs_folder, tmp_path / "configs", ignore=kept)
-    cells_folder = tmp_path / "configs" / "cells"
-    return cells_folder / "demo.yaml"
-
-
 def _key(changes: dict[str, Any]) -> str:
     return next(iter(changes))
 
 
 @pytest.mark.parametrize("changes", NONSENSE.values(), ids=NONSENSE)
 def test_nonsense_is_refused_by_every_verb_before_anything_is_written(
-    cell: Path, changes: dict[str, Any], capsys: pytest.CaptureFixture[str]
+    cell_file: Path, changes: dict[str, Any], capsys: pytest.CaptureFixture[str]
 ) -> None:
     calibration: Calibration = replace(_demo, **{"filter": FILTER, **changes})
-    path = cell.parent / "calibration.yaml"
-    out = cell.parent / "out"
+    path = cell_file.parent / "calibration.yaml"
+    out = cell_file.parent / "out"
     path.write_bytes(encode_calibration(calibration))  # which computes the digests of this content
-    controller = load_cell(cell).controller_path
+    controller = load_cell(cell_file).controller_path
     assert controller is not None
     before = controller.read_bytes()
-    kept = sorted(cell.parent.iterdir())
-    file = str(cell)
+    kept = sorted(cell_file.parent.iterdir())
+    file = str(cell_file)
     fitted = str(path)
     verbs = [
         ["apply", file, fitted, "--yes"],
@@ -90,4 +79,4 @@ def test_nonsense_is_refused_by_every_verb_before_anything_is_written(
         assert code == ExitCode.DATA_UNFIT, (verb, said)
         assert _key(changes) in said, (verb, said)
     assert controller.read_bytes() == before
-    assert sorted(cell.parent.iterdir()) == kept
+    assert sorted(cell_file.parent.iterdir()) == kept

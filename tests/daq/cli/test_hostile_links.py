@@ -5,7 +5,6 @@ circles and other users' links, refused by name.
 from __future__ import annotations
 
 import os
-import shutil
 import stat
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
@@ -36,15 +35,10 @@ REFUSED = {ExitCode.CALIBRATION_REFUSED, ExitCode.DATA_UNFIT, ExitCode.CONFIGURA
 
 
 @pytest.fixture
-def cell(tmp_path: Path) -> Path:
+def cell_file(cell_file: Path) -> Path:
     """The demo cell with a job, in a folder of its own."""
-    kept = shutil.ignore_patterns("*.jsonl*", "*.sqlite*")
-    configs_folder = Path(__file__).parents[3] / "configs"
-    shutil.copytree(configs_folder, tmp_path / "configs", ignore=kept)
-    cells_folder = tmp_path / "configs" / "cells"
-    path = cells_folder / "demo.yaml"
-    path.write_text(path.read_text() + JOB)
-    return path
+    cell_file.write_text(cell_file.read_text() + JOB)
+    return cell_file
 
 
 def make_circle(path: Path) -> None:
@@ -58,12 +52,12 @@ def make_circle(path: Path) -> None:
     "name", [*CONFIGURED, "../controllers/demo.yaml", "demo.yaml", "calibration-1.yaml"]
 )
 def test_links_in_a_circle_are_refused_by_every_verb(
-    cell: Path, name: str, capsys: pytest.CaptureFixture[str]
+    cell_file: Path, name: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    calibration = calibration_for(cell)
-    path = Path(os.path.normpath(cell.parent / name))
+    calibration = calibration_for(cell_file)
+    path = Path(os.path.normpath(cell_file.parent / name))
     make_circle(path)
-    file = str(cell)
+    file = str(cell_file)
     fitted = str(calibration)
     verbs = [["apply", file, fitted, "--yes"], ["rollback", file], ["history", file, "--verify"]]
     verbs += [
@@ -72,7 +66,7 @@ def test_links_in_a_circle_are_refused_by_every_verb(
         ["validate", fitted, "no.mcap"],
     ]
     if name in CONFIGURED:
-        out_folder = cell.parent / "out"
+        out_folder = cell_file.parent / "out"
         verbs += [
             ["history", file, "--rebuild"],
             ["certificate", fitted, "--cell", file, "--out", str(out_folder)],
@@ -97,18 +91,18 @@ def test_an_output_in_a_circle_is_not_replaced(tmp_path: Path) -> None:
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root may give a link away")
 @pytest.mark.parametrize("name", CONFIGURED)
 def test_the_link_of_another_user_is_followed_nowhere(
-    cell: Path, tmp_path: Path, name: str
+    cell_file: Path, tmp_path: Path, name: str
 ) -> None:
-    link = cell.parent / name
+    link = cell_file.parent / name
     target = tmp_path / "elsewhere"
     target.touch()
     link.symlink_to(target)
-    assert load_cell(cell).name == "demo"
+    assert load_cell(cell_file).name == "demo"
     os.lchown(link, 4711, 4711)
     with pytest.raises(ConfigurationError, match="user 4711 has made"):
-        load_cell(cell)
+        load_cell(cell_file)
     os.chown(target, 4711, 4711)  # the link's maker may write the file
-    assert load_cell(cell).name == "demo"
+    assert load_cell(cell_file).name == "demo"
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root may give a link away")

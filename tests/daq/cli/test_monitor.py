@@ -211,7 +211,7 @@ def test_what_is_not_known_is_shown_as_that() -> None:
 
 
 @pytest.fixture
-def cell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def quiet_cell_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The demo cell on a bus of this test, without other traffic: a short silence will do."""
     monkeypatch.setattr("drivers.stream.monitor.QUIET_S", 0.1)
     text = (
@@ -225,14 +225,17 @@ def cell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_a_simulated_cell_is_shown_and_left_as_it_was(
-    cell: Path, capsys: pytest.CaptureFixture[str]
+    quiet_cell_file: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     bus = open_bus(ADDRESS)
     witness = open_bus(ADDRESS)
     try:
         simulated = SimulatedCell(load_simulation(shipped_simulation("clean")), bus)
         with simulated:
-            assert main(["monitor", str(cell), "--json", "--interval", "0.5"]) == ExitCode.OK
+            assert (
+                main(["monitor", str(quiet_cell_file), "--json", "--interval", "0.5"])
+                == ExitCode.OK
+            )
         document = json.loads(capsys.readouterr().out)
         asked = []
         while (message := witness.recv(0.0)) is not None:
@@ -248,7 +251,7 @@ def test_a_simulated_cell_is_shown_and_left_as_it_was(
     masters = {one for one in asked if one[0] < 0x700 and one[1] != aborted}
     assert masters == {(0x600 + node, 0x40) for node in range(1, 7)}
     assert document["source"] == "asked"
-    declared: Cell = load_cell(cell)
+    declared: Cell = load_cell(quiet_cell_file)
     for axis, expected in zip(document["axes"], [0.0, 0.0, 90.0, 0.0, 0.0, 0.0], strict=True):
         assert axis["position"] == pytest.approx(expected, abs=1e-2)
         assert (axis["state"], axis["enabled"], axis["silent"]) == (
@@ -263,16 +266,19 @@ def test_a_simulated_cell_is_shown_and_left_as_it_was(
 
 
 def test_a_cell_that_is_not_there_is_a_device_fault(
-    cell: Path, capsys: pytest.CaptureFixture[str]
+    quiet_cell_file: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["monitor", str(cell), "--once", "--interval", "0.1"]) == ExitCode.DEVICE_FAULT
+    assert (
+        main(["monitor", str(quiet_cell_file), "--once", "--interval", "0.1"])
+        == ExitCode.DEVICE_FAULT
+    )
     streams = capsys.readouterr()
     assert "(SILENT)" in streams.out
     assert "start `drivegain simulate demo`" in streams.err
 
 
 def test_a_node_that_aborts_is_not_called_silent(
-    cell: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    quiet_cell_file: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Neither its position nor its answers are lost, and the reason is shown."""
     with (
@@ -288,7 +294,7 @@ def test_a_node_that_aborts_is_not_called_silent(
             return sound(index, subindex)
 
         monkeypatch.setattr(node._sdo, "_read", read)
-        assert main(["monitor", str(cell), "--json", "--interval", "0.5"]) == ExitCode.OK
+        assert main(["monitor", str(quiet_cell_file), "--json", "--interval", "0.5"]) == ExitCode.OK
     document = json.loads(capsys.readouterr().out)
     refusing = document["axes"][2]
     assert (refusing["silent"], refusing["rate_hz"], refusing["state"]) == (False, 0.0, None)
@@ -342,7 +348,7 @@ def test_a_node_that_answers_after_400_ms_is_called_slow(
 
 
 def test_a_cell_that_is_slower_than_one_reading_gets_more_time(
-    cell: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    quiet_cell_file: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with (
         open_bus(ADDRESS) as bus,
@@ -357,7 +363,7 @@ def test_a_cell_that_is_slower_than_one_reading_gets_more_time(
         monkeypatch.setattr(simulated.nodes[0], "request", late)
         for node in simulated.nodes:
             node.write(0x1017, 0, bytes(2))  # no heartbeat
-        assert main(["monitor", str(cell), "--json", "--interval", "0.1"]) == ExitCode.OK
+        assert main(["monitor", str(quiet_cell_file), "--json", "--interval", "0.1"]) == ExitCode.OK
     assert json.loads(capsys.readouterr().out)["axes"][0]["remark"].startswith("answers after ")
 
 

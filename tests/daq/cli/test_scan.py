@@ -22,7 +22,7 @@ from daq.cli import main
 from daq.cli.scan import no_answer
 from daq.config.cell import Cell
 from daq.config.cell_buses import bus_address, drive_axes
-from daq.config.cell_file import bundle, cell_from_bundle, load_cell
+from daq.config.cell_file import bundle, cell_from_bundle
 from daq.errors import ExitCode
 from daq.log.reader import read_log
 from daq.report.bus_views import OTHER_DRIVE, scan_report, scan_table, scan_view, scanned_nodes
@@ -40,12 +40,6 @@ from drivers.simulation.spec import SdoAbort
 from ident.model.model import DriveTrain
 from tests.faults.test_scenario import PLAN
 from tests.two_buses import on_two_buses
-
-
-@pytest.fixture(scope="module")
-def cell(checkout: Path) -> Cell:
-    """The demo cell."""
-    return load_cell(checkout / "configs/cells/demo.yaml")
 
 
 def _node(node_id: int, statusword: int | None, serial: int | None = None) -> FoundNode:

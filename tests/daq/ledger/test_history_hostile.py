@@ -4,7 +4,6 @@ reported, refused, repaired.
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 
 import pytest
@@ -20,47 +19,39 @@ from tests.daq.histories import history_of
 
 
 @pytest.fixture
-def cell(tmp_path: Path) -> Path:
-    """The demo cell in a folder of its own."""
-    kept = shutil.ignore_patterns("*.jsonl*", "*.sqlite*")
-    configs_folder = Path(__file__).parents[3] / "configs"
-    shutil.copytree(configs_folder, tmp_path / "configs", ignore=kept)
-    cells_folder = tmp_path / "configs" / "cells"
-    return cells_folder / "demo.yaml"
-
-
-@pytest.fixture
-def applied(cell: Path) -> Path:
+def applied(cell_file: Path) -> Path:
     """A calibration that the cell's controller has."""
-    calibration = calibration_for(cell)
-    assert main(["apply", str(cell), str(calibration), "--yes"]) == ExitCode.OK
-    assert main(["history", str(cell), "--verify"]) == ExitCode.OK
+    calibration = calibration_for(cell_file)
+    assert main(["apply", str(cell_file), str(calibration), "--yes"]) == ExitCode.OK
+    assert main(["history", str(cell_file), "--verify"]) == ExitCode.OK
     return calibration
 
 
-def place_of(cell: Path) -> HistoryPlace:
-    place = load_cell(cell).history
+def place_of(cell_file: Path) -> HistoryPlace:
+    place = load_cell(cell_file).history
     assert place is not None
     return place
 
 
 def test_an_audit_of_any_length_is_not_read_into_memory(
-    cell: Path, applied: Path, capsys: pytest.CaptureFixture[str]
+    cell_file: Path, applied: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with place_of(cell).audit.open("ab") as stream:
+    with place_of(cell_file).audit.open("ab") as stream:
         stream.truncate(1 << 40)  # no block of it is on the disk
-    assert main(["history", str(cell), "--verify"]) == ExitCode.DATA_UNFIT
+    assert main(["history", str(cell_file), "--verify"]) == ExitCode.DATA_UNFIT
     assert "more than 1073741824 bytes" in capsys.readouterr().err
-    calibration_text = str(calibration_for(cell, 1.01))
-    assert main(["apply", str(cell), calibration_text, "--yes"]) == ExitCode.CALIBRATION_REFUSED
+    calibration_text = str(calibration_for(cell_file, 1.01))
+    assert (
+        main(["apply", str(cell_file), calibration_text, "--yes"]) == ExitCode.CALIBRATION_REFUSED
+    )
     assert "more than 1073741824 bytes" in capsys.readouterr().err
 
 
-def kill_before_the_end(cell: Path) -> None:
+def kill_before_the_end(cell_file: Path) -> None:
     """Leave what a writer leaves that is killed right after the rename:
     the begin in the audit, and no more.
     """
-    audit = place_of(cell).audit
+    audit = place_of(cell_file).audit
     begun, *_ = audit.read_bytes().splitlines(keepends=True)
     audit.write_bytes(begun)
     audit.with_name(f"{audit.name}.head").unlink()
@@ -68,39 +59,39 @@ def kill_before_the_end(cell: Path) -> None:
 
 @pytest.mark.parametrize("repair", ["apply", "add", "rollback"])
 def test_a_write_that_was_killed_before_its_end_is_a_finding_until_it_is_entered(
-    cell: Path, applied: Path, repair: str, capsys: pytest.CaptureFixture[str]
+    cell_file: Path, applied: Path, repair: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    kill_before_the_end(cell)
-    assert main(["history", str(cell), "--verify"]) == ExitCode.DATA_UNFIT
+    kill_before_the_end(cell_file)
+    assert main(["history", str(cell_file), "--verify"]) == ExitCode.DATA_UNFIT
     error_output = capsys.readouterr().err
     said = " ".join(error_output.split())
     assert "no event of entry 1 of the audit, apply begun" in said
     assert "history CELL --add CALIBRATION" in said
     if repair == "apply":
-        assert main(["apply", str(cell), str(applied), "--yes"]) == ExitCode.OK
+        assert main(["apply", str(cell_file), str(applied), "--yes"]) == ExitCode.OK
     else:
-        assert main(["history", str(cell), "--add", str(applied)]) == ExitCode.OK
+        assert main(["history", str(cell_file), "--add", str(applied)]) == ExitCode.OK
     if repair == "rollback":
-        assert main(["rollback", str(cell)]) == ExitCode.OK
-    assert main(["history", str(cell), "--verify"]) == ExitCode.OK
-    events = history_of(cell).events
+        assert main(["rollback", str(cell_file)]) == ExitCode.OK
+    assert main(["history", str(cell_file), "--verify"]) == ExitCode.OK
+    events = history_of(cell_file).events
     found = [event.action for event in events]
     expected = [WriteAction.APPLIED, *([WriteAction.ROLLED_BACK] if repair == "rollback" else [])]
     assert found == expected
-    path = place_of(cell).audit
+    path = place_of(cell_file).audit
     actions = [entry.action for entry in read(path)]
     assert actions.count(AuditAction.WRITE_FOUND) == 1
 
 
 def test_a_write_that_was_killed_is_entered_before_the_one_that_follows(
-    cell: Path, applied: Path
+    cell_file: Path, applied: Path
 ) -> None:
-    kill_before_the_end(cell)
-    assert main(["history", str(cell), "--add", str(applied)]) == ExitCode.OK
-    later = calibration_for(cell, 1.02)
-    assert main(["apply", str(cell), str(later), "--yes"]) == ExitCode.OK
-    assert main(["history", str(cell), "--verify"]) == ExitCode.OK
-    history = history_of(cell)
+    kill_before_the_end(cell_file)
+    assert main(["history", str(cell_file), "--add", str(applied)]) == ExitCode.OK
+    later = calibration_for(cell_file, 1.02)
+    assert main(["apply", str(cell_file), str(later), "--yes"]) == ExitCode.OK
+    assert main(["history", str(cell_file), "--verify"]) == ExitCode.OK
+    history = history_of(cell_file)
     first, second = history.entries
     digests = [event.digest for event in history.events]
     assert digests == [first.digest, second.digest]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import multiprocessing
 import os
 import random
-import shutil
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -49,16 +48,6 @@ from tests.daq.histories import (
 
 FORK = multiprocessing.get_context("fork")
 NO_ONE = 65534
-
-
-@pytest.fixture
-def cell(tmp_path: Path) -> Path:
-    """The demo cell in a folder of its own."""
-    kept = shutil.ignore_patterns("*.jsonl*", "*.sqlite*")
-    configs_folder = Path(__file__).parents[3] / "configs"
-    shutil.copytree(configs_folder, tmp_path / "configs", ignore=kept)
-    cells_folder = tmp_path / "configs" / "cells"
-    return cells_folder / "demo.yaml"
 
 
 @pytest.fixture
@@ -343,11 +332,11 @@ def test_a_folder_may_have_any_name(tmp_path: Path) -> None:
     assert digests == [digest]
 
 
-def test_a_write_of_a_killed_process_is_entered_by_the_next_one(cell: Path) -> None:
+def test_a_write_of_a_killed_process_is_entered_by_the_next_one(cell_file: Path) -> None:
     """The controller has its content, and no entry ends it."""
-    ledger = ledger_of(cell)
+    ledger = ledger_of(cell_file)
     digest = enter(ledger, calibration_of(0))
-    controller = load_cell(cell).controller_path
+    controller = load_cell(cell_file).controller_path
     assert controller is not None
     controller.write_bytes(b"new")
     subject = str(controller.resolve())
@@ -364,17 +353,17 @@ def test_a_write_of_a_killed_process_is_entered_by_the_next_one(cell: Path) -> N
         subject=subject,
         details=details,
     )
-    assert history_of(cell).events == ()  # a history does not depend on what a file is today
-    assert main(["history", str(cell), "--verify"]) == 4
+    assert history_of(cell_file).events == ()  # a history does not depend on what a file is today
+    assert main(["history", str(cell_file), "--verify"]) == 4
     for _ in range(2):
         enter(ledger, calibration_of(0))
-        events = history_of(cell).events
+        events = history_of(cell_file).events
         assert [(event.who, event.at) for event in events] == [("anna", BEGIN)]
         actions = [entry.action for entry in read(ledger.audit)]
         assert actions.count(AuditAction.WRITE_FOUND) == 1
-    assert main(["history", str(cell), "--verify"]) == 0
+    assert main(["history", str(cell_file), "--verify"]) == 0
     controller.write_bytes(b"edited")
-    assert len(history_of(cell).events) == 1
+    assert len(history_of(cell_file).events) == 1
     # Its writer was not killed after all, only late.
     append(
         ledger.audit,
@@ -384,14 +373,14 @@ def test_a_write_of_a_killed_process_is_entered_by_the_next_one(cell: Path) -> N
         subject=subject,
         details={"begun": 2},
     )
-    assert len(history_of(cell).events) == 1
+    assert len(history_of(cell_file).events) == 1
 
 
-def test_the_next_write_proves_the_killed_one_before_it(cell: Path) -> None:
-    ledger = ledger_of(cell)
+def test_the_next_write_proves_the_killed_one_before_it(cell_file: Path) -> None:
+    ledger = ledger_of(cell_file)
     first = enter(ledger, calibration_of(0))
     second = enter(ledger, calibration_of(1))
-    subject = str(load_cell(cell).controller_path)
+    subject = str(load_cell(cell_file).controller_path)
     calibration = {"sha256": first, "cell": "demo"}
     details = {"sha256_before": "0" * 64, "sha256_after": "1" * 64, "calibration": calibration}
     append(
@@ -403,20 +392,20 @@ def test_the_next_write_proves_the_killed_one_before_it(cell: Path) -> None:
         details=details,
     )
     write(ledger, subject, "2" * 64, digest=second, before="1" * 64)
-    events = history_of(cell).events
+    events = history_of(cell_file).events
     digests = [event.digest for event in events]
     assert digests == [first, second]
     write(ledger, subject, "1" * 64, before="2" * 64)
-    assert history_of(cell).in_force(subject) == first
-    assert main(["history", str(cell), "--verify"]) == 0
+    assert history_of(cell_file).in_force(subject) == first
+    assert main(["history", str(cell_file), "--verify"]) == 0
 
 
-def test_another_cell_of_the_same_audit_has_its_own(cell: Path) -> None:
-    ledger = ledger_of(cell)
-    subject = str(load_cell(cell).controller_path)
+def test_another_cell_of_the_same_audit_has_its_own(cell_file: Path) -> None:
+    ledger = ledger_of(cell_file)
+    subject = str(load_cell(cell_file).controller_path)
     digest = enter(ledger, calibration_of(0))
     write(ledger, subject, "0" * 64, digest=digest)
-    before = history_of(cell)
+    before = history_of(cell_file)
     calibration = {"sha256": "2" * 64, "cell": "another"}
     details = {"sha256_after": "1" * 64, "calibration": calibration}
     begun = append(
@@ -434,14 +423,14 @@ def test_another_cell_of_the_same_audit_has_its_own(cell: Path) -> None:
         ),
     ):
         append(ledger.audit, action, at=BEGIN, who="ben", subject=subject, details=more)
-    assert history_of(cell) == before
+    assert history_of(cell_file) == before
 
 
 def test_a_calibration_that_cannot_be_read_is_a_finding(
-    cell: Path, capsys: pytest.CaptureFixture[str]
+    cell_file: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Another program entered it, or a later version."""
-    ledger = ledger_of(cell)
+    ledger = ledger_of(cell_file)
     enter(ledger, calibration_of(0))
     unreadable: list[dict[str, object]] = [
         {"document": "no calibration"},
@@ -457,8 +446,8 @@ def test_a_calibration_that_cannot_be_read_is_a_finding(
             subject="x",
             details=details,
         )
-    assert len(history_of(cell).entries) == 1
-    assert main(["history", str(cell), "--verify"]) == 4
+    assert len(history_of(cell_file).entries) == 1
+    assert main(["history", str(cell_file), "--verify"]) == 4
     error_output = capsys.readouterr().err
     said = " ".join(error_output.split())
     assert "calibration 000000000000… of entry 2: its document is" in said
@@ -467,13 +456,13 @@ def test_a_calibration_that_cannot_be_read_is_a_finding(
 
 @pytest.mark.parametrize("damage", ["edited", "first removed", "end cut off", "deleted"])
 def test_a_damaged_log_is_reported_by_each_command_that_reads_or_adds_to_it(
-    cell: Path, damage: str, caplog: pytest.LogCaptureFixture
+    cell_file: Path, damage: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     """A calibration that is missing changes the judgement of a gain and of its drift."""
     for factor in (1.0, 1.02, 1.01):
-        calibration_text = str(calibration_for(cell, factor))
-        assert main(["apply", str(cell), calibration_text, "--yes"]) == ExitCode.OK
-    ledger = ledger_of(cell)
+        calibration_text = str(calibration_for(cell_file, factor))
+        assert main(["apply", str(cell_file), calibration_text, "--yes"]) == ExitCode.OK
+    ledger = ledger_of(cell_file)
     assert not read_history(ledger).may_lack
     lines = ledger.audit.read_bytes().splitlines(keepends=True)
     changed_line = lines[0].replace(b"demo", b"dema", 1)
@@ -488,11 +477,11 @@ def test_a_damaged_log_is_reported_by_each_command_that_reads_or_adds_to_it(
         ledger.audit.unlink()
     assert read_history(ledger).may_lack
     assert verify_ledger(ledger).history.may_lack
-    calibration = str(calibration_for(cell, 1.005))
+    calibration = str(calibration_for(cell_file, 1.005))
     for command in (
-        ["apply", str(cell), calibration],
-        ["history", str(cell)],
-        ["rollback", str(cell)],
+        ["apply", str(cell_file), calibration],
+        ["history", str(cell_file)],
+        ["rollback", str(cell_file)],
     ):
         caplog.clear()
         assert main(command) == ExitCode.OK
@@ -500,38 +489,41 @@ def test_a_damaged_log_is_reported_by_each_command_that_reads_or_adds_to_it(
 
 
 def test_a_log_without_its_note_is_said_to_be_one(
-    cell: Path, capsys: pytest.CaptureFixture[str]
+    cell_file: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    calibration_text = str(calibration_for(cell))
-    assert main(["history", str(cell), "--add", calibration_text]) == ExitCode.OK
-    note = head_file(ledger_of(cell).audit)
+    calibration_text = str(calibration_for(cell_file))
+    assert main(["history", str(cell_file), "--add", calibration_text]) == ExitCode.OK
+    note = head_file(ledger_of(cell_file).audit)
     for spoil in (note.unlink, lambda: note.write_text("no digest\n")):
         spoil()
-        assert main(["history", str(cell), "--verify"]) == ExitCode.OK
+        assert main(["history", str(cell_file), "--verify"]) == ExitCode.OK
         printed = capsys.readouterr().out
         assert ("a missing end of the audit log would not be noticed") in " ".join(printed.split())
-    assert main(["history", str(cell), "--add", str(calibration_for(cell, 1.01))]) == ExitCode.OK
+    assert (
+        main(["history", str(cell_file), "--add", str(calibration_for(cell_file, 1.01))])
+        == ExitCode.OK
+    )
     capsys.readouterr()
-    assert main(["history", str(cell), "--verify"]) == ExitCode.OK
+    assert main(["history", str(cell_file), "--verify"]) == ExitCode.OK
     assert "cannot be seen" not in capsys.readouterr().out
 
 
 def test_a_path_that_is_not_utf_8_is_in_the_history(
-    cell: Path, capsys: pytest.CaptureFixture[str]
+    cell_file: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     other = "/other/ctl\udcff.yaml"
-    ledger = ledger_of(cell)
-    subject = str(load_cell(cell).controller_path)
+    ledger = ledger_of(cell_file)
+    subject = str(load_cell(cell_file).controller_path)
     first = enter(ledger, calibration_of(0))
     write(ledger, other, "1" * 64, digest=first)
     digest = enter(ledger, calibration_of(1))
     write(ledger, subject, "2" * 64, digest=digest)
     acknowledge(ledger, "J4", since=BEGIN, at=BEGIN, who="anna", why="gearbox \udcff")
-    history = history_of(cell)
+    history = history_of(cell_file)
     targets = [event.target for event in history.events]
     assert targets == [other, subject]
     assert history.in_force(other) == first
-    assert main(["history", str(cell), "--verify"]) == 0
-    for arguments in (["--axis", "J4"], ["--json"], ["--csv", str(cell.with_suffix(".csv"))]):
-        assert main(["history", str(cell), *arguments]) == 0
+    assert main(["history", str(cell_file), "--verify"]) == 0
+    for arguments in (["--axis", "J4"], ["--json"], ["--csv", str(cell_file.with_suffix(".csv"))]):
+        assert main(["history", str(cell_file), *arguments]) == 0
     assert "ctl\udcff" not in capsys.readouterr().out

@@ -40,76 +40,72 @@ WRITERS = ["Ada", "Bert", "Cleo"]
 
 
 @pytest.fixture
-def cell(tmp_path: Path) -> Path:
+def cell_file(cell_file: Path) -> Path:
     """The demo cell with audit log, history and controller file of the version before."""
-    kept = shutil.ignore_patterns("*.jsonl*", "*.sqlite*")
-    configs_folder = Path(__file__).parents[3] / "configs"
-    shutil.copytree(configs_folder, tmp_path / "configs", ignore=kept)
-    cells_folder = tmp_path / "configs" / "cells"
-    cell = cells_folder / "demo.yaml"
     for name in ("demo.audit.jsonl", "demo.history.sqlite"):
-        shutil.copy(FILES / name, cell.with_name(name))
-    controllers_folder = cell.parents[1] / "controllers"
-    demo_path = controllers_folder / "demo.yaml"
-    shutil.copy(FILES / "controller.yaml", demo_path)
-    return cell
+        shutil.copy(FILES / name, cell_file.with_name(name))
+    controllers_folder = cell_file.parents[1] / "controllers"
+    shutil.copy(FILES / "controller.yaml", controllers_folder / "demo.yaml")
+    return cell_file
 
 
-def stored_of(cell: Path) -> Path:
-    return cell.with_name("demo.history.sqlite")
+def stored_of(cell_file: Path) -> Path:
+    return cell_file.with_name("demo.history.sqlite")
 
 
-def audit_of(cell: Path) -> Path:
-    return cell.with_name("demo.audit.jsonl")
+def audit_of(cell_file: Path) -> Path:
+    return cell_file.with_name("demo.audit.jsonl")
 
 
-def change(cell: Path, statements: str) -> None:
-    with closing(sqlite3.connect(stored_of(cell))) as other:
+def change(cell_file: Path, statements: str) -> None:
+    with closing(sqlite3.connect(stored_of(cell_file))) as other:
         other.executescript(f"{statements};")
         other.commit()
 
 
-def shown(cell: Path, capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
+def shown(cell_file: Path, capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
     """What `history --json` prints."""
     capsys.readouterr()
-    assert main(["history", str(cell), "--json"]) == ExitCode.OK
+    assert main(["history", str(cell_file), "--json"]) == ExitCode.OK
     printed = capsys.readouterr().out
     found: dict[str, Any] = json.loads(printed)
     return found
 
 
-def writers_of(cell: Path) -> list[str]:
-    events = history_of(cell).events
+def writers_of(cell_file: Path) -> list[str]:
+    events = history_of(cell_file).events
     return [event.who.split()[0] for event in events]
 
 
-def asides_of(cell: Path) -> list[Path]:
-    return sorted(cell.parent.glob("demo.history.sqlite.*.bak"))
+def asides_of(cell_file: Path) -> list[Path]:
+    return sorted(cell_file.parent.glob("demo.history.sqlite.*.bak"))
 
 
 def test_the_first_command_migrates_it_and_shows_what_the_version_before_showed(
-    cell: Path, capsys: pytest.CaptureFixture[str]
+    cell_file: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    content = stored_of(cell).read_bytes()
+    content = stored_of(cell_file).read_bytes()
     text = (FILES / "history.json").read_text()
     expected = json.loads(text)
-    assert shown(cell, capsys) == expected
-    assert not stored_of(cell).exists()
-    (aside,) = asides_of(cell)
+    assert shown(cell_file, capsys) == expected
+    assert not stored_of(cell_file).exists()
+    (aside,) = asides_of(cell_file)
     assert aside.read_bytes() == content
-    entries = read(audit_of(cell))
+    entries = read(audit_of(cell_file))
     assert len(entries) == 13  # the figures of three calibrations
-    assert main(["history", str(cell), "--verify"]) == ExitCode.OK
-    assert shown(cell, capsys) == expected
-    assert read(audit_of(cell)) == entries
-    assert writers_of(cell) == WRITERS
+    assert main(["history", str(cell_file), "--verify"]) == ExitCode.OK
+    assert shown(cell_file, capsys) == expected
+    assert read(audit_of(cell_file)) == entries
+    assert writers_of(cell_file) == WRITERS
 
 
-def test_what_reads_only_shows_the_same_and_writes_nothing(cell: Path) -> None:
-    before = {path: path.read_bytes() for path in cell.parent.iterdir() if path.is_file()}
-    ledger = ledger_of(cell)
+def test_what_reads_only_shows_the_same_and_writes_nothing(cell_file: Path) -> None:
+    before = {path: path.read_bytes() for path in cell_file.parent.iterdir() if path.is_file()}
+    ledger = ledger_of(cell_file)
     history = read_history(ledger)
-    assert {path: path.read_bytes() for path in cell.parent.iterdir() if path.is_file()} == before
+    assert {
+        path: path.read_bytes() for path in cell_file.parent.iterdir() if path.is_file()
+    } == before
     migrate(ledger, who="anna", at=BEGIN)
     after = read_history(ledger)
     expected = (history.entries, history.events, history.acknowledgements)
@@ -117,74 +113,74 @@ def test_what_reads_only_shows_the_same_and_writes_nothing(cell: Path) -> None:
 
 
 @pytest.mark.parametrize("command", ["apply", "add", "migrate"])
-def test_each_command_that_enters_something_migrates_it(cell: Path, command: str) -> None:
-    calibration = str(calibration_for(cell, 1.005))
+def test_each_command_that_enters_something_migrates_it(cell_file: Path, command: str) -> None:
+    calibration = str(calibration_for(cell_file, 1.005))
     arguments = {
-        "apply": ["apply", str(cell), calibration, "--yes"],
-        "add": ["history", str(cell), "--add", calibration],
-        "migrate": ["history", str(cell), "--migrate"],
+        "apply": ["apply", str(cell_file), calibration, "--yes"],
+        "add": ["history", str(cell_file), "--add", calibration],
+        "migrate": ["history", str(cell_file), "--migrate"],
     }[command]
     assert main(arguments) == ExitCode.OK
-    assert not stored_of(cell).exists()
-    assert len(asides_of(cell)) == 1
-    assert writers_of(cell)[:3] == WRITERS
-    assert main(["history", str(cell), "--verify"]) == ExitCode.OK
+    assert not stored_of(cell_file).exists()
+    assert len(asides_of(cell_file)) == 1
+    assert writers_of(cell_file)[:3] == WRITERS
+    assert main(["history", str(cell_file), "--verify"]) == ExitCode.OK
 
 
 def test_what_only_the_history_had_gets_into_the_audit(
-    cell: Path, capsys: pytest.CaptureFixture[str]
+    cell_file: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A write without an audit log, as a program could make it,
     and one whose entry names only its begin.
     """
     change(
-        cell,
+        cell_file,
         "INSERT INTO event (digest, deed, at, who, target) SELECT digest, 'applied', "
         "'2027-01-01T00:00:00.000000+00:00', 'kim', '/other.yaml' FROM calibration LIMIT 1",
     )
-    before = read_history(ledger_of(cell))
-    assert shown(cell, capsys)["calibrations"] == 3
-    assert writers_of(cell) == [*WRITERS, "kim"]
-    (found,) = [one for one in read(audit_of(cell)) if one.action is AuditAction.WRITE_FOUND]
+    before = read_history(ledger_of(cell_file))
+    assert shown(cell_file, capsys)["calibrations"] == 3
+    assert writers_of(cell_file) == [*WRITERS, "kim"]
+    (found,) = [one for one in read(audit_of(cell_file)) if one.action is AuditAction.WRITE_FOUND]
     assert found.details["migrated"] is True
-    after = history_of(cell)
+    after = history_of(cell_file)
     expected = [event.action for event in before.events]
     actions = [event.action for event in after.events]
     assert actions == expected
     assert after.in_force("/other.yaml") == before.in_force("/other.yaml")
     # An earlier version was run again, and found no history of its own.
-    first_aside = asides_of(cell)[0]
-    first_aside.rename(stored_of(cell))
-    assert shown(cell, capsys)["calibrations"] == 3
-    assert writers_of(cell) == [*WRITERS, "kim"]
+    first_aside = asides_of(cell_file)[0]
+    first_aside.rename(stored_of(cell_file))
+    assert shown(cell_file, capsys)["calibrations"] == 3
+    assert writers_of(cell_file) == [*WRITERS, "kim"]
 
 
 def test_a_history_of_a_version_whose_audit_has_no_calibrations(
-    cell: Path, capsys: pytest.CaptureFixture[str]
+    cell_file: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Only the last lines of the audit log are of calibrations:
     without them it is one of that version.
     """
-    audit = audit_of(cell)
+    audit = audit_of(cell_file)
     lines = audit.read_bytes().splitlines(keepends=True)
     audit.write_bytes(b"".join(lines[:2]))
     change(
-        cell,
+        cell_file,
         "DELETE FROM event WHERE number > 1; DELETE FROM acknowledgement; DELETE FROM "
         "sqlite_sequence",
     )
-    calibrations = read_stored(stored_of(cell)).calibrations
+    calibrations = read_stored(stored_of(cell_file)).calibrations
     digests = {one.digest for one in calibrations}
     assert len(digests) == 3
-    assert main(["history", str(cell), "--verify"]) == ExitCode.OK
-    entries = history_of(cell).entries
+    assert main(["history", str(cell_file), "--verify"]) == ExitCode.OK
+    entries = history_of(cell_file).entries
     assert {one.digest for one in entries} == digests
-    assert writers_of(cell) == ["Ada"]
+    assert writers_of(cell_file) == ["Ada"]
 
 
 @pytest.mark.parametrize("calls", range(4))
 def test_a_migration_that_is_killed_is_finished_by_the_next_command(
-    cell: Path, calls: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    cell_file: Path, calls: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Before each of the three entries, and before the file is renamed."""
     left = [calls]
@@ -202,12 +198,12 @@ def test_a_migration_that_is_killed_is_finished_by_the_next_command(
         for name in ("append", "set_aside"):
             patch.setattr(ledger_module, name, killed_later(getattr(ledger_module, name)))
         with pytest.raises(KeyboardInterrupt):
-            migrate(ledger_of(cell), who="anna", at=BEGIN)
-    assert stored_of(cell).exists()
-    assert len(read(audit_of(cell))) == 10 + calls
-    assert shown(cell, capsys) == json.loads((FILES / "history.json").read_text())
-    assert len(read(audit_of(cell))) == 13
-    assert len(asides_of(cell)) == 1
+            migrate(ledger_of(cell_file), who="anna", at=BEGIN)
+    assert stored_of(cell_file).exists()
+    assert len(read(audit_of(cell_file))) == 10 + calls
+    assert shown(cell_file, capsys) == json.loads((FILES / "history.json").read_text())
+    assert len(read(audit_of(cell_file))) == 13
+    assert len(asides_of(cell_file)) == 1
 
 
 @pytest.mark.parametrize(
@@ -232,35 +228,35 @@ def test_a_migration_that_is_killed_is_finished_by_the_next_command(
     ],
 )
 def test_a_row_of_what_the_audit_log_has_is_never_believed(
-    cell: Path, statement: str, capsys: pytest.CaptureFixture[str]
+    cell_file: Path, statement: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    change(cell, statement)
-    assert main(["history", str(cell), "--verify"]) == ExitCode.OK
-    assert shown(cell, capsys) == json.loads((FILES / "history.json").read_text())
-    assert writers_of(cell) == WRITERS
+    change(cell_file, statement)
+    assert main(["history", str(cell_file), "--verify"]) == ExitCode.OK
+    assert shown(cell_file, capsys) == json.loads((FILES / "history.json").read_text())
+    assert writers_of(cell_file) == WRITERS
     # With the figures of three calibrations, and nothing of that row
-    assert len(read(audit_of(cell))) == 13
-    assert len(asides_of(cell)) == 1
+    assert len(read(audit_of(cell_file))) == 13
+    assert len(asides_of(cell_file)) == 1
 
 
 @pytest.mark.parametrize("document", ["'x'", "replace(document, 'rows: ', 'rows: 1')"])
 def test_a_calibration_that_is_damaged_is_reported_and_nothing_is_taken_over(
-    cell: Path, document: str, capsys: pytest.CaptureFixture[str]
+    cell_file: Path, document: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    audit = audit_of(cell).read_bytes()
-    change(cell, f"UPDATE calibration SET document = {document}")
+    audit = audit_of(cell_file).read_bytes()
+    change(cell_file, f"UPDATE calibration SET document = {document}")
     for options in ((), ("--verify",)):
-        assert main(["history", str(cell), *options]) == ExitCode.DATA_UNFIT
+        assert main(["history", str(cell_file), *options]) == ExitCode.DATA_UNFIT
         error_output = capsys.readouterr().err
         said = " ".join(error_output.split())
         assert "--migrate" in said
         assert "…: its document is" in said
-    assert stored_of(cell).exists()
-    assert main(["history", str(cell), "--migrate", "--verify"]) == ExitCode.OK
+    assert stored_of(cell_file).exists()
+    assert main(["history", str(cell_file), "--migrate", "--verify"]) == ExitCode.OK
     assert "what only it had was not taken over" in " ".join(capsys.readouterr().err.split())
-    assert audit_of(cell).read_bytes().startswith(audit)
-    assert len(asides_of(cell)) == 1
-    assert shown(cell, capsys) == json.loads((FILES / "history.json").read_text())
+    assert audit_of(cell_file).read_bytes().startswith(audit)
+    assert len(asides_of(cell_file)) == 1
+    assert shown(cell_file, capsys) == json.loads((FILES / "history.json").read_text())
 
 
 @pytest.mark.parametrize(
@@ -275,49 +271,52 @@ def test_a_calibration_that_is_damaged_is_reported_and_nothing_is_taken_over(
     ],
 )
 def test_a_file_that_is_no_history_is_refused_and_kept(
-    cell: Path, name: str, spoil: Callable[[Path], None], capsys: pytest.CaptureFixture[str]
+    cell_file: Path, name: str, spoil: Callable[[Path], None], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    spoil(stored_of(cell))
-    content = stored_of(cell).read_bytes()
-    calibration_text = str(calibration_for(cell))
+    spoil(stored_of(cell_file))
+    content = stored_of(cell_file).read_bytes()
+    calibration_text = str(calibration_for(cell_file))
     for options in ((), ("--verify",), ("--add", calibration_text)):
-        assert main(["history", str(cell), *options]) == ExitCode.DATA_UNFIT, name
+        assert main(["history", str(cell_file), *options]) == ExitCode.DATA_UNFIT, name
         error_output = capsys.readouterr().err
         assert "--migrate" in " ".join(error_output.split())
     # The write-back goes on without it: the gains are judged by the calibration and the
     # controller's file.
-    assert main(["apply", str(cell), str(calibration_for(cell))]) == ExitCode.OK
-    assert stored_of(cell).read_bytes() == content
-    assert main(["history", str(cell), "--migrate", "--verify"]) == ExitCode.OK
+    assert main(["apply", str(cell_file), str(calibration_for(cell_file))]) == ExitCode.OK
+    assert stored_of(cell_file).read_bytes() == content
+    assert main(["history", str(cell_file), "--migrate", "--verify"]) == ExitCode.OK
     assert "what only it had was not taken over" in " ".join(capsys.readouterr().err.split())
-    (aside,) = asides_of(cell)
+    (aside,) = asides_of(cell_file)
     assert aside.read_bytes() == content
-    assert writers_of(cell) == WRITERS
+    assert writers_of(cell_file) == WRITERS
 
 
 def test_a_sound_file_that_cannot_be_read_now_is_never_put_aside(
-    cell: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    cell_file: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(migration_module, "BUSY_S", 0.05)
-    before = read(audit_of(cell))
-    with closing(sqlite3.connect(stored_of(cell), isolation_level=None)) as other:
+    before = read(audit_of(cell_file))
+    with closing(sqlite3.connect(stored_of(cell_file), isolation_level=None)) as other:
         other.execute("BEGIN EXCLUSIVE")
-        assert main(["history", str(cell), "--migrate"]) == ExitCode.DATA_UNFIT
+        assert main(["history", str(cell_file), "--migrate"]) == ExitCode.DATA_UNFIT
     error_output = capsys.readouterr().err
     said = " ".join(error_output.split())
     assert "SQLITE_BUSY" in said
     assert "try again" in said
-    assert asides_of(cell) == []
-    assert read(audit_of(cell)) == before
-    assert main(["history", str(cell), "--migrate", "--verify"]) == ExitCode.OK
-    assert writers_of(cell) == WRITERS
+    assert asides_of(cell_file) == []
+    assert read(audit_of(cell_file)) == before
+    assert main(["history", str(cell_file), "--migrate", "--verify"]) == ExitCode.OK
+    assert writers_of(cell_file) == WRITERS
 
 
 @pytest.mark.parametrize(
     "error", [PermissionError(13, "Permission denied"), FileNotFoundError(2, "No such file")]
 )
 def test_a_file_that_keeps_its_name_keeps_no_calibration_out(
-    cell: Path, error: OSError, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    cell_file: Path,
+    error: OSError,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     """Its folder may be read only, or another process may rename it first."""
 
@@ -326,12 +325,12 @@ def test_a_file_that_keeps_its_name_keeps_no_calibration_out(
 
     with monkeypatch.context() as patch:
         patch.setattr(ledger_module, "set_aside", refuse)
-        calibration_text = str(calibration_for(cell, 1.005))
-        assert main(["history", str(cell), "--add", calibration_text]) == ExitCode.OK
+        calibration_text = str(calibration_for(cell_file, 1.005))
+        assert main(["history", str(cell_file), "--add", calibration_text]) == ExitCode.OK
     assert ("keeps its name" in caplog.text) == isinstance(error, PermissionError)
-    assert main(["history", str(cell), "--verify"]) == ExitCode.OK
-    assert len(history_of(cell).entries) == 4
-    assert len(asides_of(cell)) == 1
+    assert main(["history", str(cell_file), "--verify"]) == ExitCode.OK
+    assert len(history_of(cell_file).entries) == 4
+    assert len(asides_of(cell_file)) == 1
 
 
 def _pragma(path: Path, setting: str) -> None:
@@ -344,10 +343,10 @@ def _execute(path: Path, statements: str) -> None:
         other.commit()
 
 
-def test_an_empty_file_is_an_empty_history(cell: Path) -> None:
-    stored_of(cell).write_bytes(b"")
-    assert main(["history", str(cell), "--verify"]) == ExitCode.OK
-    assert writers_of(cell) == WRITERS
+def test_an_empty_file_is_an_empty_history(cell_file: Path) -> None:
+    stored_of(cell_file).write_bytes(b"")
+    assert main(["history", str(cell_file), "--verify"]) == ExitCode.OK
+    assert writers_of(cell_file) == WRITERS
 
 
 @settings(max_examples=30, deadline=None)
@@ -368,10 +367,10 @@ def test_a_damaged_file_is_reported_and_never_a_surprise(random_: random.Random)
             assert "with text" not in str(error)
 
 
-def test_an_unfinished_transaction_of_a_killed_writer_is_undone_first(cell: Path) -> None:
+def test_an_unfinished_transaction_of_a_killed_writer_is_undone_first(cell_file: Path) -> None:
     child = os.fork()
     if child == 0:
-        connection = sqlite3.connect(stored_of(cell), isolation_level=None)
+        connection = sqlite3.connect(stored_of(cell_file), isolation_level=None)
         # Pages go to the file, and the old ones to the journal, at once
         connection.execute("PRAGMA cache_size = 1")
         connection.execute("BEGIN IMMEDIATE")
@@ -379,32 +378,32 @@ def test_an_unfinished_transaction_of_a_killed_writer_is_undone_first(cell: Path
         connection.execute("DELETE FROM event")
         os.kill(os.getpid(), signal.SIGKILL)
     os.waitpid(child, 0)
-    assert stored_of(cell).with_name("demo.history.sqlite-journal").stat().st_size
-    assert main(["history", str(cell), "--verify"]) == ExitCode.OK
-    assert writers_of(cell) == WRITERS
-    (aside,) = asides_of(cell)
+    assert stored_of(cell_file).with_name("demo.history.sqlite-journal").stat().st_size
+    assert main(["history", str(cell_file), "--verify"]) == ExitCode.OK
+    assert writers_of(cell_file) == WRITERS
+    (aside,) = asides_of(cell_file)
     content = (FILES / "demo.history.sqlite").read_bytes()
     assert aside.read_bytes() == content
 
 
 def test_one_that_is_locked_for_long_is_reported(
-    cell: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    cell_file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("daq.ledger.migration.BUSY_S", 0.01)
-    with closing(sqlite3.connect(stored_of(cell), isolation_level=None)) as other:
+    with closing(sqlite3.connect(stored_of(cell_file), isolation_level=None)) as other:
         other.execute("BEGIN EXCLUSIVE")
-        assert main(["history", str(cell)]) == ExitCode.DATA_UNFIT
+        assert main(["history", str(cell_file)]) == ExitCode.DATA_UNFIT
         error_output = capsys.readouterr().err
         assert "who has it open" in " ".join(error_output.split())
         other.execute("ROLLBACK")
-    assert main(["history", str(cell)]) == ExitCode.OK
+    assert main(["history", str(cell_file)]) == ExitCode.OK
 
 
 @pytest.mark.parametrize("lost", ["changed", "deleted", "cut off"])
 def test_nothing_is_migrated_into_an_audit_that_was_changed(
-    cell: Path, lost: str, capsys: pytest.CaptureFixture[str]
+    cell_file: Path, lost: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    audit = audit_of(cell)
+    audit = audit_of(cell_file)
     content = audit.read_bytes()
     if lost == "changed":
         audit.write_bytes(content.replace(b'"who":"Ada', b'"who":"Eve', 1))
@@ -413,34 +412,36 @@ def test_nothing_is_migrated_into_an_audit_that_was_changed(
         audit.write_bytes(b"".join(lines[:4]))
     else:
         audit.unlink()
-    stored = stored_of(cell).read_bytes()
+    stored = stored_of(cell_file).read_bytes()
     for options in (["--migrate"], ["--verify"]):
-        assert main(["history", str(cell), *options]) == ExitCode.DATA_UNFIT
+        assert main(["history", str(cell_file), *options]) == ExitCode.DATA_UNFIT
         assert "demo.audit.jsonl" in capsys.readouterr().err
-        assert stored_of(cell).read_bytes() == stored
+        assert stored_of(cell_file).read_bytes() == stored
     # What is left is shown all the same, and the write-back goes on.
-    assert main(["history", str(cell)]) == ExitCode.OK
-    calibration_text = str(calibration_for(cell, 1.005))
-    assert main(["apply", str(cell), calibration_text, "--yes"]) == ExitCode.OK
-    assert len(history_of(cell).entries) == 4
-    assert stored_of(cell).read_bytes() == stored
-    assert main(["history", str(cell), "--verify"]) == ExitCode.DATA_UNFIT
+    assert main(["history", str(cell_file)]) == ExitCode.OK
+    calibration_text = str(calibration_for(cell_file, 1.005))
+    assert main(["apply", str(cell_file), calibration_text, "--yes"]) == ExitCode.OK
+    assert len(history_of(cell_file).entries) == 4
+    assert stored_of(cell_file).read_bytes() == stored
+    assert main(["history", str(cell_file), "--verify"]) == ExitCode.DATA_UNFIT
 
 
 def test_a_cell_whose_gains_are_applied_again_knows_the_old_write(
-    cell: Path, capsys: pytest.CaptureFixture[str]
+    cell_file: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The controller has the gains of Ada's calibration; the audit log names another folder."""
-    ledger = ledger_of(cell)
+    ledger = ledger_of(cell_file)
     events = read_history(ledger).events
     (first,) = [event for event in events if event.who.startswith("Ada")]
     assert first.action is WriteAction.APPLIED
-    in_force = shown(cell, capsys)["in_force"]
+    in_force = shown(cell_file, capsys)["in_force"]
     assert in_force == first.digest
 
 
-def test_another_audit_than_the_cells_has_no_history_of_sqlite(cell: Path, tmp_path: Path) -> None:
-    ledger = Ledger.of(ledger_of(cell).cell, tmp_path / "another.jsonl")
+def test_another_audit_than_the_cells_has_no_history_of_sqlite(
+    cell_file: Path, tmp_path: Path
+) -> None:
+    ledger = Ledger.of(ledger_of(cell_file).cell, tmp_path / "another.jsonl")
     assert ledger is not None
     assert not ledger.outdated
     assert read_history(ledger).entries == ()

@@ -19,7 +19,6 @@ import pytest
 from canopen.sdo.exceptions import SdoAbortedError
 
 from daq.config.cell import Cell
-from daq.config.cell_file import load_cell
 from daq.log import feed as feeds
 from daq.log.feed import (
     ACCEPTED,
@@ -39,14 +38,6 @@ from daq.log.feed import (
 from drivers.errors import SetupRefused
 from drivers.messages import CellEvent, EventKind
 from tests.daq.console.feeds import Recording, arrivals, facts
-
-
-@pytest.fixture(scope="module")
-def cell(checkout: Path) -> Cell:
-    """The demo cell."""
-    cells_folder = checkout / "configs" / "cells"
-    path = cells_folder / "demo.yaml"
-    return load_cell(path)
 
 
 @pytest.fixture

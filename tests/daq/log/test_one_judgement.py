@@ -16,7 +16,6 @@ from hypothesis import strategies as st
 
 from daq.cli.app import main
 from daq.config.cell import Cell
-from daq.config.cell_file import load_cell
 from daq.errors import DataError, ExitCode, LogIncomplete, LogUnreadable
 from daq.log.bag_writer import export_bag
 from daq.log.container import RECORDS
@@ -391,9 +390,3 @@ def test_every_axis_keeps_columns_of_its_own(cell: Cell, names: Sequence[str]) -
     axes = tuple(replace(axis, name=name) for axis, name in zip(cell.axes, names, strict=True))
     changed_cell = replace(cell, axes=axes)
     assert len(set(column_names(changed_cell))) == 6
-
-
-@pytest.fixture(scope="module")
-def cell(checkout: Path) -> Cell:
-    """The demo cell."""
-    return load_cell(checkout / "configs/cells/demo.yaml")

@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 
 from daq.config.cell import Cell, model_of
-from daq.config.cell_file import load_cell
 from daq.config.workspace import Clearance
 from daq.report.plan_preview import STEP_S, find_preview, preview_data, preview_page
 from daq.workflow.experiment import PlannedMove, experiment_duration_s, scene_of
@@ -33,30 +32,31 @@ WALL = Box("wall", (0.3, -0.05, 0.0), (0.6, 0.05, 1.0))
 
 
 @pytest.fixture(scope="module")
-def cell(checkout: Path) -> Cell:
+def walled_cell(cell: Cell) -> Cell:
     """The demo cell with a wall in front of the arm."""
     clearance = Clearance(None, 0.02, (), (WALL,))
-    path = checkout / "configs/cells/demo.yaml"
-    return replace(load_cell(path), clearance=clearance)
+    return replace(cell, clearance=clearance)
 
 
 @pytest.fixture(scope="module")
-def checker(cell: Cell) -> Checker:
+def checker(walled_cell: Cell) -> Checker:
     """Distances of its arm."""
-    robot = model_of(cell).robot
-    return scene_of(cell, robot, 4.59).checker
+    robot = model_of(walled_cell).robot
+    return scene_of(walled_cell, robot, 4.59).checker
 
 
 @pytest.fixture(scope="module")
-def drawn(cell: Cell, checker: Checker) -> dict[str, Any]:
+def drawn(walled_cell: Cell, checker: Checker) -> dict[str, Any]:
     """The data of its page."""
-    text = json.dumps(preview_data(cell, MOVES, checker))
+    text = json.dumps(preview_data(walled_cell, MOVES, checker))
     found: dict[str, Any] = json.loads(text)
     return found
 
 
-def test_the_rows_pass_through_every_target_at_its_time(cell: Cell, drawn: dict[str, Any]) -> None:
-    robot = model_of(cell).robot
+def test_the_rows_pass_through_every_target_at_its_time(
+    walled_cell: Cell, drawn: dict[str, Any]
+) -> None:
+    robot = model_of(walled_cell).robot
     position_rad = np.array(TARGETS)
     origin_m = poses(robot, position_rad).origin_m
     at = origin_m.swapaxes(0, 1)
@@ -69,7 +69,9 @@ def test_the_rows_pass_through_every_target_at_its_time(cell: Cell, drawn: dict[
     chain_difference = np.abs(chains[second] - at[1])
     largest_chain_difference = chain_difference.max(axis=(1, 2))
     assert largest_chain_difference.min() < 0.001
-    assert drawn["time_s"][-1] == pytest.approx(experiment_duration_s(cell, MOVES), abs=2 * STEP_S)
+    assert drawn["time_s"][-1] == pytest.approx(
+        experiment_duration_s(walled_cell, MOVES), abs=2 * STEP_S
+    )
     # Half of its limits at most, and the slowest axis of each move at just that.
     speeds = np.array([axis["values"] for axis in drawn["speeds"]])
     assert 45.0 < speeds.max() <= 50.1
@@ -120,14 +122,14 @@ def test_the_reach_is_that_of_every_moving_capsule_at_every_row(
     assert radius_m == pytest.approx(across, abs=0.002)
 
 
-def test_the_page_says_what_is_not_known(cell: Cell, checker: Checker) -> None:
-    page = preview_page(cell, MOVES, checker, b"plan")
+def test_the_page_says_what_is_not_known(walled_cell: Cell, checker: Checker) -> None:
+    page = preview_page(walled_cell, MOVES, checker, b"plan")
     assert "The shape of the arm is a guess from the URDF" in page
     assert "declares no workspace: tables" in page
     assert "drivegain record checks the way there" in page
     assert "below z = 0" not in page
     assert re.search(r"Smallest clearance: -\d+ mm, at [\d.]+ s; 20 mm must be kept", page)
-    bare = replace(cell, clearance=None)
+    bare = replace(walled_cell, clearance=None)
     robot = model_of(bare).robot
     scene = scene_of(bare, robot, 4.59)
     page = preview_page(bare, MOVES, scene.checker, b"plan")
@@ -135,13 +137,13 @@ def test_the_page_says_what_is_not_known(cell: Cell, checker: Checker) -> None:
 
 
 def test_the_page_needs_no_other_file_and_runs_only_its_own_script(
-    cell: Cell, checker: Checker
+    walled_cell: Cell, checker: Checker
 ) -> None:
-    hostile = replace(cell, name="</script><script>alert(1)</script>")
+    hostile = replace(walled_cell, name="</script><script>alert(1)</script>")
     page = preview_page(hostile, MOVES, checker, b"plan")
     assert not re.search(r"https?:|src=|url\(", page)
     assert "<script>alert" not in page
-    changed_cell = replace(cell, name="a\u202eb")
+    changed_cell = replace(walled_cell, name="a\u202eb")
     turned = preview_page(changed_cell, MOVES, checker, b"plan")
     assert "\u202e" not in turned
     assert turned.count("a\\u202eb") == 2
@@ -151,13 +153,13 @@ def test_the_page_needs_no_other_file_and_runs_only_its_own_script(
 
 
 def test_a_preview_is_found_by_the_content_of_its_plan(
-    cell: Cell, checker: Checker, tmp_path: Path
+    walled_cell: Cell, checker: Checker, tmp_path: Path
 ) -> None:
     plan = tmp_path / "plan.yaml"
     plan.write_bytes(b"moves")
     (tmp_path / "another.html").write_text("<html>")
     assert find_preview(plan) is None
-    (tmp_path / "look.html").write_text(preview_page(cell, MOVES, checker, b"moves"))
+    (tmp_path / "look.html").write_text(preview_page(walled_cell, MOVES, checker, b"moves"))
     assert find_preview(plan) == tmp_path / "look.html"
     plan.write_bytes(b"other moves")
     assert find_preview(plan) is None

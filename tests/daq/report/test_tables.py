@@ -21,7 +21,6 @@ from rich.table import Table
 
 from daq.cli.terminal import PIPE_COLUMNS
 from daq.config.cell import Cell
-from daq.config.cell_file import load_cell
 from daq.jobs.cell_fit import Failure, Summary
 from daq.jobs.fleet import FleetRow, fleet_view
 from daq.ledger.ledger import read_history
@@ -69,14 +68,10 @@ CALIBRATION = replace(demo_calibration(), gains=GAINS, relative_error_percent=ER
 
 
 @pytest.fixture(scope="module")
-def cell(checkout: Path) -> Cell:
+def long_named_cell(cell: Cell) -> Cell:
     """The demo cell, with long names."""
-    demo = load_cell(checkout / "configs/cells/demo.yaml")
-    axes = tuple(replace(axis, name=name) for axis, name in zip(demo.axes, AXES, strict=False))
-    return replace(
-        demo,
-        axes=axes,
-    )
+    axes = tuple(replace(axis, name=name) for axis, name in zip(cell.axes, AXES, strict=False))
+    return replace(cell, axes=axes)
 
 
 @pytest.fixture(scope="module")
@@ -438,9 +433,9 @@ def _tables(parts: Iterable[RenderableType]) -> Iterator[Table]:
 
 @pytest.mark.parametrize("name", EXAMPLES)
 def test_every_number_of_a_table_is_whole_at_80_columns_and_in_a_pipe(
-    name: str, cell: Cell, series: Any
+    name: str, long_named_cell: Cell, series: Any
 ) -> None:
-    parts = EXAMPLES[name](cell, series)
+    parts = EXAMPLES[name](long_named_cell, series)
     tables = list(_tables(parts))
     assert tables
     for table in tables:

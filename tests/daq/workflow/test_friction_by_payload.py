@@ -27,13 +27,13 @@ WARMER = 0.75  #: Friction in the loaded runs over that in the bare ones, which 
 
 
 @pytest.fixture(scope="module")
-def cell() -> Cell:
-    path = shipped_configurations() / "cells" / "demo.yaml"
-    return replace(load_cell(path), friction_by_payload=True)
+def payload_friction_cell(cell: Cell) -> Cell:
+    """The demo cell, whose friction may differ between bare and loaded runs."""
+    return replace(cell, friction_by_payload=True)
 
 
 @pytest.fixture(scope="module")
-def shelf(cell: Cell) -> Shelf:
+def shelf(payload_friction_cell: Cell) -> Shelf:
     truth = tx40_truth()
     parameters = truth.parameters.copy()
     parameters[truth.model.friction_columns] *= WARMER
@@ -46,7 +46,7 @@ def shelf(cell: Cell) -> Shelf:
         run = record(arm, f"run{number}", rng, payload, noise_a=0.05, seconds=22.0)
         digest = f"{number:064x}"
         runs[run.name] = replace(run, digest=digest)
-    return Shelf(cell, runs)
+    return Shelf(payload_friction_cell, runs)
 
 
 @pytest.mark.slow
@@ -89,9 +89,11 @@ def test_without_the_key_friction_that_falls_becomes_gain(
     assert np.max(np.abs(fitted.estimate.gains / GAINS - 1.0)) > 0.015
 
 
-def test_a_description_that_differs_in_it_is_another_one_for_a_fit(cell: Cell) -> None:
-    changed_cell = replace(cell, friction_by_payload=False)
-    assert differing_sections(cell, changed_cell) == ("friction_by_payload",)
+def test_a_description_that_differs_in_it_is_another_one_for_a_fit(
+    payload_friction_cell: Cell,
+) -> None:
+    changed_cell = replace(payload_friction_cell, friction_by_payload=False)
+    assert differing_sections(payload_friction_cell, changed_cell) == ("friction_by_payload",)
 
 
 def test_the_key_is_read_and_is_off_where_a_cell_file_does_not_have_it(tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ from tests.ident.recordings import gantry_truth
 
 
 @pytest.fixture(scope="module")
-def cell() -> Cell:
+def tx40_cell() -> Cell:
     path = shipped_configurations() / "cells" / "tx40.yaml"
     return load_cell(path)
 
@@ -32,9 +32,9 @@ def _checked(*found: Finding) -> GeometryCheck:
     return GeometryCheck(gravity=None, mistakes=found, hidden_zeros=())
 
 
-def test_a_time_skew_asks_for_the_stamps_and_for_no_encoder(cell: Cell) -> None:
+def test_a_time_skew_asks_for_the_stamps_and_for_no_encoder(tx40_cell: Cell) -> None:
     check = _checked(_finding(TimeSkew(), 0, 0.003))
-    (one,) = check_diagnoses(check, cell, model_of(cell))
+    (one,) = check_diagnoses(check, tx40_cell, model_of(tx40_cell))
     assert (one.name, one.axes) == ("time-skew", ())
     assert one.found == (
         "all currents late by 3.00 ± 0.07 ms relative to the positions, the same on every axis"
@@ -43,21 +43,24 @@ def test_a_time_skew_asks_for_the_stamps_and_for_no_encoder(cell: Cell) -> None:
     assert "no single encoder or drive is late" in one.remedy
 
 
-def test_an_early_skew_is_said_to_be_early(cell: Cell) -> None:
+def test_an_early_skew_is_said_to_be_early(tx40_cell: Cell) -> None:
     effect = TimeSkew(backwards=1)
     check = _checked(_finding(effect, 0, -0.003))
-    (one,) = check_diagnoses(check, cell, model_of(cell))
+    (one,) = check_diagnoses(check, tx40_cell, model_of(tx40_cell))
     assert "all currents early by 3.00 ± 0.07 ms" in one.found
 
 
-def test_each_late_current_is_named_on_its_axis(cell: Cell) -> None:
+def test_each_late_current_is_named_on_its_axis(tx40_cell: Cell) -> None:
     effect = Lag(filter_s=0.0015)
     first = _finding(effect, 0, 0.003)
     lag = Lag(filter_s=0.0015)
     second = _finding(lag, 1, 0.003)
     check = _checked(first, second)
-    diagnoses = check_diagnoses(check, cell, model_of(cell))
-    expected = [("current-late", cell.axis_names[:1]), ("current-late", cell.axis_names[1:2])]
+    diagnoses = check_diagnoses(check, tx40_cell, model_of(tx40_cell))
+    expected = [
+        ("current-late", tx40_cell.axis_names[:1]),
+        ("current-late", tx40_cell.axis_names[1:2]),
+    ]
     assert [(one.name, one.axes) for one in diagnoses] == expected
     for one in diagnoses:
         assert one.found == f"the current of {one.axes[0]} late by 3.00 ± 0.07 ms"
@@ -65,9 +68,9 @@ def test_each_late_current_is_named_on_its_axis(cell: Cell) -> None:
         assert "encoder" not in one.remedy
 
 
-def test_a_late_encoder_asks_for_the_encoder(cell: Cell) -> None:
+def test_a_late_encoder_asks_for_the_encoder(tx40_cell: Cell) -> None:
     check = _checked(_finding(LatePosition(), 2, 0.003))
-    (one,) = check_diagnoses(check, cell, model_of(cell))
+    (one,) = check_diagnoses(check, tx40_cell, model_of(tx40_cell))
     assert one.name == "position-late"
     assert "what delays this encoder alone" in one.remedy
 
@@ -88,10 +91,10 @@ def test_the_zero_of_a_slide_that_shifts_the_whole_arm_is_hidden_by_symmetry() -
     assert said == f"Zeros that are not seen here: of X, Y: {why}."
 
 
-def test_two_zeros_that_are_seen_one_by_one_only_are_named_together(cell: Cell) -> None:
+def test_two_zeros_that_are_seen_one_by_one_only_are_named_together(tx40_cell: Cell) -> None:
     hidden_pairs = ((1, 2), (2, 4))
     check = GeometryCheck(gravity=None, mistakes=(), hidden_zeros=(), hidden_pairs=hidden_pairs)
-    robot = model_of(cell).robot
-    said = hidden_zeros_text(check, cell.axis_names, robot)
+    robot = model_of(tx40_cell).robot
+    said = hidden_zeros_text(check, tx40_cell.axis_names, robot)
     assert said.startswith("Not seen here where both zeros are off, one against the other")
     assert said.endswith("J2 with J3, J3 with J5.")

@@ -26,16 +26,16 @@ SECONDS = 9.0
 
 
 @pytest.fixture(scope="module")
-def cell() -> Cell:
+def dualv_cell() -> Cell:
     """Four motors, three degrees of freedom."""
     path = shipped_configurations() / "cells" / "dualv.yaml"
     return load_cell(path)
 
 
 @pytest.fixture(scope="module")
-def experiment(cell: Cell) -> Experiment:
+def experiment(dualv_cell: Cell) -> Experiment:
     """With its payload."""
-    return experiment_of(cell)
+    return experiment_of(dualv_cell)
 
 
 def test_the_payload_is_expected_at_the_platform() -> None:
@@ -52,9 +52,9 @@ def test_the_payload_is_expected_at_the_platform() -> None:
 
 
 @pytest.fixture(scope="module")
-def searched(cell: Cell, experiment: Experiment) -> tuple[Plan, list[tuple[int, float]]]:
+def searched(dualv_cell: Cell, experiment: Experiment) -> tuple[Plan, list[tuple[int, float]]]:
     """The planner's own plan, and what it reported: exchanges so far and σ of the worst gain."""
-    return _searched(cell, experiment, 16)
+    return _searched(dualv_cell, experiment, 16)
 
 
 @pytest.fixture(scope="module")
@@ -78,19 +78,19 @@ def _searched(
 
 
 def test_the_planners_own_plan_shows_every_gain(
-    cell: Cell, experiment: Experiment, made: Plan
+    dualv_cell: Cell, experiment: Experiment, made: Plan
 ) -> None:
-    paths = paths_of(cell, made.moves)
+    paths = paths_of(dualv_cell, made.moves)
     runs = [(experiment.excitation(paths)[0], RUNS)]
     judged = verdicts(experiment.design, runs)
     assert judged.rank == judged.known_preload_rank == 4
-    assert not judged.sentences(cell.axis_names)
-    positions = [axis.limits.position for axis in cell.axes]
+    assert not judged.sentences(dualv_cell.axis_names)
+    positions = [axis.limits.position for axis in dualv_cell.axes]
     lower, upper = np.array(positions).T
     target_rad = [move.target_rad for move in made.moves]
     targets = np.array(target_rad)
     assert ((targets >= lower) & (targets <= upper)).all()
-    text = plan_text(Path("plan.yaml"), None, cell, experiment, made, judged, SECONDS)
+    text = plan_text(Path("plan.yaml"), None, dualv_cell, experiment, made, judged, SECONDS)
     assert (
         "Internal preload obscures no gain: these moves determine 4 of 4 independent directions"
     ) in text
@@ -98,21 +98,21 @@ def test_the_planners_own_plan_shows_every_gain(
     lines = text.partition("Assumed:")[2].splitlines()
     largest_line_count = max(len(line) for line in lines[:7])
     assert largest_line_count < 110
-    page = preview_page(cell, made.moves, experiment.scene.checker, b"plan")
+    page = preview_page(dualv_cell, made.moves, experiment.scene.checker, b"plan")
     assert "The shape of the arm is unknown: links of a closed chain are not guessed" in page
 
 
 def test_a_weak_gain_is_told_how_to_become_good(
-    cell: Cell, experiment: Experiment, made: Plan
+    dualv_cell: Cell, experiment: Experiment, made: Plan
 ) -> None:
     """σ falls with the square root of the time: the same moves made so many times over are good."""
-    paths = paths_of(cell, made.moves)
+    paths = paths_of(dualv_cell, made.moves)
     excitation = experiment.excitation(paths)[0]
     runs = [(excitation, RUNS)]
     judged = verdicts(experiment.design, runs)
     worst = max(gain.std_percent for gain in judged.gains)
     assert worst > 1.0
-    text = plan_text(Path("plan.yaml"), None, cell, experiment, made, judged, SECONDS)
+    text = plan_text(Path("plan.yaml"), None, dualv_cell, experiment, made, judged, SECONDS)
     (line,) = (line for line in text.splitlines() if line.startswith("For good gains (1 %)"))
     seconds = float(line.partition("--duration ")[2].partition(")")[0])
     assert "a heavier payload" in line
@@ -123,7 +123,7 @@ def test_a_weak_gain_is_told_how_to_become_good(
     assert largest_std_percent <= 1.0
     good = replace(judged, gains=repeated.gains)
     assert "For good gains" not in plan_text(
-        Path("plan.yaml"), None, cell, experiment, made, good, SECONDS
+        Path("plan.yaml"), None, dualv_cell, experiment, made, good, SECONDS
     )
 
 
@@ -149,19 +149,19 @@ def test_the_assembly_pose_that_was_found_is_shown(tmp_path: Path) -> None:
 
 
 def test_an_interrupted_search_is_repeated_by_its_number_of_exchanges(
-    cell: Cell, experiment: Experiment, searched: tuple[Plan, list[tuple[int, float]]]
+    dualv_cell: Cell, experiment: Experiment, searched: tuple[Plan, list[tuple[int, float]]]
 ) -> None:
     """What `plan` says when it is interrupted:
     the first exchanges do not depend on how many are to come.
     """
     longer = searched[1]
     assert [done for done, _ in longer] == [8, 16]
-    expected = _searched(cell, experiment, 8)[1]
+    expected = _searched(dualv_cell, experiment, 8)[1]
     assert longer[:1] == expected
 
 
 def test_the_same_moves_around_one_pose_hide_gains(
-    cell: Cell, experiment: Experiment, made: Plan
+    dualv_cell: Cell, experiment: Experiment, made: Plan
 ) -> None:
     checker = experiment.scene.checker
     near = [
@@ -171,19 +171,19 @@ def test_the_same_moves_around_one_pose_hide_gains(
     moves = tuple(
         replace(m, target_rad=tuple(t.tolist())) for m, t in zip(made.moves, near, strict=True)
     )
-    paths = paths_of(cell, moves)
+    paths = paths_of(dualv_cell, moves)
     runs = [(experiment.excitation(paths)[0], RUNS)]
     judged = verdicts(experiment.design, runs)
     hidden = judged.hidden(Hidden.PRELOAD)
     assert hidden
     assert judged.known_preload_rank is not None
     assert judged.rank < judged.known_preload_rank
-    named = [cell.axis_names[axis] for axis in hidden]
+    named = [dualv_cell.axis_names[axis] for axis in hidden]
     changed_made = replace(made, moves=moves)
-    text = plan_text(Path("plan.yaml"), None, cell, experiment, changed_made, judged, SECONDS)
+    text = plan_text(Path("plan.yaml"), None, dualv_cell, experiment, changed_made, judged, SECONDS)
     (line,) = (line for line in text.splitlines() if line.startswith("Internal preload obscures"))
-    assert [name for name in cell.axis_names if name in line] == named
-    report = plan_report(Path("plan.yaml"), cell, experiment, made, judged)
+    assert [name for name in dualv_cell.axis_names if name in line] == named
+    report = plan_report(Path("plan.yaml"), dualv_cell, experiment, made, judged)
     gains = report.gains
     assert [gain.axis for gain in gains if gain.hidden_by == "preload"] == named
     for gain in gains:
@@ -192,14 +192,14 @@ def test_the_same_moves_around_one_pose_hide_gains(
 
 
 def test_a_workspace_too_small_for_the_gains_is_refused_with_the_reason(
-    cell: Cell, experiment: Experiment
+    dualv_cell: Cell, experiment: Experiment
 ) -> None:
     low = np.radians(-2.0)
     high = np.radians(2.0)
     axes = tuple(
-        replace(axis, limits=replace(axis.limits, position=(low, high))) for axis in cell.axes
+        replace(axis, limits=replace(axis.limits, position=(low, high))) for axis in dualv_cell.axes
     )
-    tight = replace(cell, axes=axes)
+    tight = replace(dualv_cell, axes=axes)
     changed_experiment = replace(experiment, cell=tight)
     with pytest.raises(UsageError, match="Internal preload obscures the gains of"):
         plan(

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from daq.config.cell import Cell, model_of
-from daq.config.cell_file import load_cell
 from daq.errors import LogsDiffer
 from daq.workflow.live_prediction import (
     LEAST_S,
@@ -31,14 +30,6 @@ from tests.daq.console.feeds import facts, predicting_calibration
 RATE_HZ = 500.0
 SAMPLES = 3000
 CYCLES = np.arange(SAMPLES)
-
-
-@pytest.fixture(scope="module")
-def cell(checkout: Path) -> Cell:
-    """The demo cell."""
-    cells_folder = checkout / "configs" / "cells"
-    path = cells_folder / "demo.yaml"
-    return load_cell(path)
 
 
 def _motion(cell: Cell) -> tuple[np.ndarray, np.ndarray]:

@@ -10,7 +10,6 @@ import pytest
 from numpy.typing import NDArray
 
 from daq.config.cell import Cell, model_of
-from daq.config.cell_file import load_cell
 from daq.log.feed import RunFacts, packet_dtype
 from daq.workflow.quick_look import BlockMove, GainsSoFar, RunSoFar
 from drivers.messages import CellEvent, EventKind
@@ -24,12 +23,6 @@ TARGET_PERCENT = 0.5
 COUNT_RAD = 1e-6
 RAW_A = 1e-4
 PLACE = BlockMove("block-2-loaded", 3, 14)
-
-
-@pytest.fixture(scope="module")
-def cell() -> Cell:
-    """The demonstration's cell."""
-    return load_cell(CELLS / "demo.yaml")
 
 
 @pytest.fixture(scope="module")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +10,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from daq.config.cell import Cell, model_of
-from daq.config.cell_file import load_cell
 from daq.documents.calibration_file import decode_calibration, encode_calibration
 from daq.workflow.validate import not_corrected_since, on_cell, with_described
 from ident.calibration import AcceptedEffect, Calibration, Parameter
@@ -23,12 +21,6 @@ from tests.daq.calibrations import demo_calibration
 ZERO_RAD = 0.03
 TURN_RAD = (0.04, -0.02)
 angles = st.floats(-0.3, 0.3)
-
-
-@pytest.fixture(scope="module")
-def cell(checkout: Path) -> Cell:
-    """The demo cell."""
-    return load_cell(checkout / "configs/cells/demo.yaml")
 
 
 def _calibration(*effects: AcceptedEffect) -> Calibration:

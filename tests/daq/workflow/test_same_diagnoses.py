@@ -260,7 +260,7 @@ MISTAKES: dict[str, tuple[Mistake, str]] = {
 
 
 @pytest.fixture(scope="module")
-def cell(tmp_path_factory: pytest.TempPathFactory) -> Cell:
+def three_axis_cell(tmp_path_factory: pytest.TempPathFactory) -> Cell:
     folder = tmp_path_factory.mktemp("cell")
     (folder / "arm.urdf").write_text(THREE_AXES.urdf)
     gains = three_axes_truth().gains
@@ -292,7 +292,7 @@ def texts(diagnoses: tuple[Diagnosis, ...]) -> list[str]:
 
 @pytest.mark.parametrize("mistake", MISTAKES)
 def test_the_same_is_said_by_every_verb(
-    cell: Cell, recorded: Runs, monkeypatch: pytest.MonkeyPatch, mistake: str
+    three_axis_cell: Cell, recorded: Runs, monkeypatch: pytest.MonkeyPatch, mistake: str
 ) -> None:
     change, expected = MISTAKES[mistake]
     runs = {run.name: replace(run, digest=f"{int(run.name[1:]):064x}") for run in change(recorded)}
@@ -300,7 +300,7 @@ def test_the_same_is_said_by_every_verb(
     def load(
         path: Path, given: Cell | None = None, _lossy: LossyLogs = LossyLogs.REFUSED
     ) -> tuple[Run, Cell]:
-        return runs[path.name], given or cell
+        return runs[path.name], given or three_axis_cell
 
     for module in (fit_module, validate_module):
         monkeypatch.setattr(module, "load_run", load)
@@ -354,7 +354,7 @@ def test_the_same_is_said_by_every_verb(
     ("degrees", "next_step"), [(4.0, "correct the description"), (0.0, "drivegain residual")]
 )
 def test_a_wrong_description_is_corrected_before_the_next_step(
-    cell: Cell,
+    three_axis_cell: Cell,
     recorded: Runs,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
@@ -366,7 +366,7 @@ def test_a_wrong_description_is_corrected_before_the_next_step(
         for run in recorded
     }
     for module in (fit_module, validate_module):
-        monkeypatch.setattr(module, "load_run", lambda path, *_: (runs[path.name], cell))
+        monkeypatch.setattr(module, "load_run", lambda path, *_: (runs[path.name], three_axis_cell))
     paths = [Path(f"r{number}") for number in range(RUNS)]
     fitted = fit(paths[:USED], holdout=paths[USED:])
     calibration = calibration_of(fitted, WHEN)
@@ -382,11 +382,11 @@ def test_a_wrong_description_is_corrected_before_the_next_step(
 
 
 def test_a_zero_that_a_given_description_changes_is_tested_on_a_run_without_load(
-    cell: Cell, recorded: Runs, monkeypatch: pytest.MonkeyPatch
+    three_axis_cell: Cell, recorded: Runs, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It explains a small part of what a run without load leaves, and was not named."""
     runs = {run.name: replace(run, digest=f"{int(run.name[1:]):064x}") for run in recorded}
-    monkeypatch.setattr(fit_module, "load_run", lambda path, *_: (runs[path.name], cell))
+    monkeypatch.setattr(fit_module, "load_run", lambda path, *_: (runs[path.name], three_axis_cell))
     logs = [Path(f"r{number}") for number in range(USED)]
     calibration = calibration_of(fit(logs), WHEN)
     given = Recording(
@@ -398,7 +398,7 @@ def test_a_zero_that_a_given_description_changes_is_tested_on_a_run_without_load
     moved = replace(
         offset(recorded[6], 4.0), current_a=recorded[6].current_a + noise_a, recording=given
     )
-    other = replace(cell, digest="other", recording_digest="other")
+    other = replace(three_axis_cell, digest="other", recording_digest="other")
     found: dict[str, set[str]] = {}
     changed_moved = replace(moved, recording=None)
     for name, run in {"given": moved, "recorded": changed_moved}.items():
@@ -415,10 +415,10 @@ def test_a_zero_that_a_given_description_changes_is_tested_on_a_run_without_load
 
 
 def test_a_zero_that_a_fit_has_named_is_named_after_a_search_that_finds_nothing(
-    cell: Cell, recorded: Runs, monkeypatch: pytest.MonkeyPatch
+    three_axis_cell: Cell, recorded: Runs, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     runs = {run.name: offset(run) for run in recorded}
-    monkeypatch.setattr(fit_module, "load_run", lambda path, *_: (runs[path.name], cell))
+    monkeypatch.setattr(fit_module, "load_run", lambda path, *_: (runs[path.name], three_axis_cell))
     logs = [Path(f"r{number}") for number in range(USED)]
     fitted = fit(logs)
     evidence = fitted.evidence()
@@ -433,10 +433,10 @@ def test_a_zero_that_a_fit_has_named_is_named_after_a_search_that_finds_nothing(
 
 
 def test_a_zero_that_the_search_has_set_aside_is_named_and_one_in_its_noise_is_not(
-    cell: Cell, recorded: Runs, monkeypatch: pytest.MonkeyPatch
+    three_axis_cell: Cell, recorded: Runs, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     runs = {run.name: run for run in recorded}
-    monkeypatch.setattr(fit_module, "load_run", lambda path, *_: (runs[path.name], cell))
+    monkeypatch.setattr(fit_module, "load_run", lambda path, *_: (runs[path.name], three_axis_cell))
     logs = [Path(f"r{number}") for number in range(USED)]
     fitted = fit(logs)
     std = np.radians(0.1)
@@ -467,7 +467,7 @@ def test_a_zero_that_the_search_has_set_aside_is_named_and_one_in_its_noise_is_n
 
 
 def test_an_undecided_zero_is_named_and_refuses_the_gains_and_is_in_their_sigma(
-    cell: Cell, recorded: Runs, monkeypatch: pytest.MonkeyPatch
+    three_axis_cell: Cell, recorded: Runs, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A held-out run of three seconds decides nothing."""
     time_s = recorded[6].time_s
@@ -480,7 +480,7 @@ def test_an_undecided_zero_is_named_and_refuses_the_gains_and_is_in_their_sigma(
         current_a=current_a[:600],
     )
     runs = {run.name: replace(offset(run), digest=run.name) for run in (*recorded[:USED], short)}
-    monkeypatch.setattr(fit_module, "load_run", lambda path, *_: (runs[path.name], cell))
+    monkeypatch.setattr(fit_module, "load_run", lambda path, *_: (runs[path.name], three_axis_cell))
     monkeypatch.setattr(fit_module, "find_effects", partial(find_effects, families=FEW_FAMILIES))
     logs = [Path(f"r{number}") for number in range(USED)]
     holdout = [Path("r6")]
@@ -500,13 +500,13 @@ def test_an_undecided_zero_is_named_and_refuses_the_gains_and_is_in_their_sigma(
 
 
 def test_a_zero_that_a_search_has_corrected_is_named_with_its_deviation(
-    cell: Cell, recorded: Runs, monkeypatch: pytest.MonkeyPatch
+    three_axis_cell: Cell, recorded: Runs, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It was "about -35 deg", and gains and held-out errors of the corrected robot followed."""
     runs = {
         run.name: replace(offset(run, 35.0), digest=f"{int(run.name[1:]):064x}") for run in recorded
     }
-    monkeypatch.setattr(fit_module, "load_run", lambda path, *_: (runs[path.name], cell))
+    monkeypatch.setattr(fit_module, "load_run", lambda path, *_: (runs[path.name], three_axis_cell))
     monkeypatch.setattr(fit_module, "find_effects", partial(find_effects, families=FEW_FAMILIES))
     logs = [Path(f"r{number}") for number in range(USED)]
     fitted = fit(logs, keep_rows=True)
@@ -522,7 +522,7 @@ def test_a_zero_that_a_search_has_corrected_is_named_with_its_deviation(
 @pytest.mark.parametrize("json", [False, True])
 @pytest.mark.parametrize("verb", ["fit", "residual"])
 def test_gains_that_mean_nothing_are_refused(
-    cell: Cell,
+    three_axis_cell: Cell,
     recorded: Runs,
     monkeypatch: pytest.MonkeyPatch,
     tmp_path: Path,
@@ -535,7 +535,7 @@ def test_gains_that_mean_nothing_are_refused(
         run.name: replace(run, digest=f"{int(run.name[1:]):064x}")
         for run in map(reversed_position, recorded)
     }
-    monkeypatch.setattr(fit_module, "load_run", lambda path, *_: (runs[path.name], cell))
+    monkeypatch.setattr(fit_module, "load_run", lambda path, *_: (runs[path.name], three_axis_cell))
     monkeypatch.setattr(fit_module, "find_effects", partial(find_effects, families=FEW_FAMILIES))
     out = tmp_path / "calibration.yaml"
     command = [verb, *(f"r{number}" for number in range(USED)), "--out", str(out)]
@@ -562,7 +562,7 @@ def test_what_is_said_of_another_run_leaves_the_gains_as_they_are() -> None:
 
 
 def test_a_lean_that_a_zero_explains_as_well_is_named_with_it_and_no_number_is_to_be_typed_in(
-    cell: Cell, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    three_axis_cell: Cell, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     truth = three_axes_truth()
     lean = np.radians(2.0)
@@ -586,7 +586,7 @@ def test_a_lean_that_a_zero_explains_as_well_is_named_with_it_and_no_number_is_t
         )
         digest = f"{number:064x}"
         runs[run.name] = replace(run, digest=digest)
-    monkeypatch.setattr(fit_module, "load_run", lambda path, *_: (runs[path.name], cell))
+    monkeypatch.setattr(fit_module, "load_run", lambda path, *_: (runs[path.name], three_axis_cell))
     logs = [Path(f"r{number}") for number in range(4)]
     fitted = fit(logs, gains_fixed=True)
     (found,) = fitted.diagnoses
@@ -601,31 +601,31 @@ def test_a_lean_that_a_zero_explains_as_well_is_named_with_it_and_no_number_is_t
     assert "Next: record the moves that CHECK asks for" in capsys.readouterr().err
 
 
-def test_each_hidden_zero_has_its_own_reason(cell: Cell) -> None:
+def test_each_hidden_zero_has_its_own_reason(three_axis_cell: Cell) -> None:
     robot = three_axes_truth().model.robot
     hidden_zeros = (0, 1, 2)
     check = GeometryCheck(gravity=None, mistakes=(), hidden_zeros=hidden_zeros)
-    text = hidden_zeros_text(check, cell.axis_names, robot)
+    text = hidden_zeros_text(check, three_axis_cell.axis_names, robot)
     assert "of J1: another one turns or shifts the whole arm" in text
     assert "of J3: no joint is behind it" in text
     assert "of J2: these moves do not show it" in text
     changed_check = replace(check, hidden_zeros=())
-    assert hidden_zeros_text(changed_check, cell.axis_names, robot) == ""
+    assert hidden_zeros_text(changed_check, three_axis_cell.axis_names, robot) == ""
 
 
 def test_the_key_that_is_named_reverses_a_position_and_no_current(
-    cell: Cell, recorded: Runs, monkeypatch: pytest.MonkeyPatch
+    three_axis_cell: Cell, recorded: Runs, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     runs = {
         run.name: replace(run, digest=f"{int(run.name[1:]):064x}")
         for run in map(reversed_position, recorded)
     }
-    monkeypatch.setattr(fit_module, "load_run", lambda path, *_: (runs[path.name], cell))
+    monkeypatch.setattr(fit_module, "load_run", lambda path, *_: (runs[path.name], three_axis_cell))
     logs = [Path(f"r{number}") for number in range(USED)]
     (diagnosis,) = fit(logs, keep_rows=True).diagnoses
     assert (diagnosis.name, diagnosis.axes) == ("position-reversed", ("J2",))
     assert "the row of J2 in `drive_train.ratio`" in diagnosis.remedy
-    declared = cell.ratio
+    declared = three_axis_cell.ratio
     corrected = declared * np.array([1.0, -1.0, 1.0])[:, None]
     # The way from motor to joint turns for J2 alone, and the torque of a motor at its joint stays.
     counts = np.array([1.0, 2.0, 3.0])

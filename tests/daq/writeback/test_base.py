@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
 from dataclasses import replace
 from datetime import UTC, datetime
-from pathlib import Path
 
 import pytest
 from hypothesis import given
@@ -17,10 +15,9 @@ from daq.errors import CalibrationRefused, UsageError
 from daq.writeback.gates.gate import GateContext
 from daq.writeback.gates.target import base as base_gate
 from daq.writeback.request import Edit, GateFinding, Request, change_digest, parse_base
-from drivers.canopen.bus import BusAddress
 from drivers.simulation.cell import SimulatedCell
 from tests.daq.calibrations import IDENTIFIED, NAMEPLATE, demo_calibration
-from tests.daq.drives import apply_in_drives, entered_gain, on_its_own_bus, simulated
+from tests.daq.drives import apply_in_drives, entered_gain
 
 
 def _findings(base: str | None, before: bytes, after: bytes) -> list[GateFinding]:
@@ -58,25 +55,11 @@ def test_what_is_no_digest_is_refused(text: str) -> None:
         parse_base(text, b"old")
 
 
-@pytest.fixture
-def cell(request: pytest.FixtureRequest, tmp_path: Path) -> Cell:
-    return on_its_own_bus(tmp_path, request.node.name)
-
-
-@pytest.fixture
-def simulation(cell: Cell) -> Iterator[SimulatedCell]:
-    """Its drives."""
-    channel = cell.buses[0].channel
-    address = BusAddress("virtual", channel)
-    with simulated(address) as running:
-        yield running
-
-
 def test_the_drives_get_the_change_that_was_reviewed_and_no_other(
-    cell: Cell, simulation: SimulatedCell, capsys: pytest.CaptureFixture[str]
+    drive_cell: Cell, simulation: SimulatedCell, capsys: pytest.CaptureFixture[str]
 ) -> None:
     calibration = demo_calibration()
-    apply_in_drives(cell, calibration=calibration, base=None, yes=False)
+    apply_in_drives(drive_cell, calibration=calibration, base=None, yes=False)
     printed = capsys.readouterr().out
     base = printed.split("--base ")[1].split(maxsplit=1)[0]
     gain = calibration.gains[3].value
@@ -84,9 +67,9 @@ def test_the_drives_get_the_change_that_was_reviewed_and_no_other(
     gains = (*calibration.gains[:3], moved, *calibration.gains[4:])
     another = replace(calibration, gains=gains)
     with pytest.raises(CalibrationRefused, match="have changed since the dry run"):
-        apply_in_drives(cell, calibration=another, base=base, yes=True)
+        apply_in_drives(drive_cell, calibration=another, base=base, yes=True)
     assert [entered_gain(node) for node in simulation.nodes] == pytest.approx(NAMEPLATE)
-    apply_in_drives(cell, calibration=calibration, base=base, yes=True)
+    apply_in_drives(drive_cell, calibration=calibration, base=base, yes=True)
     assert [entered_gain(node) for node in simulation.nodes] == pytest.approx(IDENTIFIED)
     with pytest.raises(CalibrationRefused, match="as --base says"):
-        apply_in_drives(cell, calibration=another, base=base, yes=True)
+        apply_in_drives(drive_cell, calibration=another, base=base, yes=True)

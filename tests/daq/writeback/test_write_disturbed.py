@@ -24,16 +24,6 @@ WRITING = ("fsync", "write", "replace", "unlink", "fchmod")
 DENIALS = ("nothing was", "it is as it was", "as before")
 
 
-@pytest.fixture
-def cell(tmp_path: Path) -> Path:
-    """The demo cell in a folder of its own."""
-    kept = shutil.ignore_patterns("*.jsonl*", "*.sqlite*")
-    configs_folder = Path(__file__).parents[3] / "configs"
-    shutil.copytree(configs_folder, tmp_path / "configs", ignore=kept)
-    cells_folder = tmp_path / "configs" / "cells"
-    return cells_folder / "demo.yaml"
-
-
 class Disk:
     """Counts the calls of the operating system, and fails at one of them or from one of them on."""
 
@@ -67,12 +57,12 @@ class Disk:
         return call
 
 
-def apply(cell: Path, calibration: Path) -> int:
-    return main(["apply", str(cell), str(calibration), "--yes"])
+def apply(cell_file: Path, calibration: Path) -> int:
+    return main(["apply", str(cell_file), str(calibration), "--yes"])
 
 
-def controller_of(cell: Path) -> Path:
-    path = load_cell(cell).controller_path
+def controller_of(cell_file: Path) -> Path:
+    path = load_cell(cell_file).controller_path
     assert path is not None
     return path
 
@@ -81,25 +71,27 @@ def controller_of(cell: Path) -> Path:
 @pytest.mark.parametrize("lasting", [False, True], ids=["once", "from then on"])
 @pytest.mark.parametrize("verb", ["apply", "rollback"])
 def test_no_message_denies_a_write_and_the_next_command_enters_it(
-    cell: Path,
+    cell_file: Path,
     verb: str,
     lasting: bool,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    controller, calibration = controller_of(cell), calibration_for(cell)
+    controller, calibration = controller_of(cell_file), calibration_for(cell_file)
     if verb == "rollback":
-        assert apply(cell, calibration) == ExitCode.OK
+        assert apply(cell_file, calibration) == ExitCode.OK
     work: Callable[[], int] = (
-        (lambda: apply(cell, calibration)) if verb == "apply" else lambda: main([verb, str(cell)])
+        (lambda: apply(cell_file, calibration))
+        if verb == "apply"
+        else lambda: main([verb, str(cell_file)])
     )
-    kept = cell.parents[1].with_name("kept")
-    shutil.copytree(cell.parents[1], kept)
+    kept = cell_file.parents[1].with_name("kept")
+    shutil.copytree(cell_file.parents[1], kept)
     before = controller.read_bytes()
 
     def run(at: int | None) -> tuple[int, Disk]:
-        shutil.rmtree(cell.parents[1])
-        shutil.copytree(kept, cell.parents[1])
+        shutil.rmtree(cell_file.parents[1])
+        shutil.copytree(kept, cell_file.parents[1])
         capsys.readouterr()
         with monkeypatch.context() as patch:
             disk = Disk(patch, at, lasting=lasting)
@@ -121,11 +113,11 @@ def test_no_message_denies_a_write_and_the_next_command_enters_it(
         else:
             assert code == ExitCode.UNEXPECTED, (at, said)
         if verb == "apply":
-            assert apply(cell, calibration) == ExitCode.OK, at
+            assert apply(cell_file, calibration) == ExitCode.OK, at
             assert controller.read_bytes() == after
         else:
-            assert main(["history", str(cell), "--add", str(calibration)]) == ExitCode.OK, at
-        assert main(["history", str(cell), "--verify"]) == ExitCode.OK, (
+            assert main(["history", str(cell_file), "--add", str(calibration)]) == ExitCode.OK, at
+        assert main(["history", str(cell_file), "--verify"]) == ExitCode.OK, (
             at,
             capsys.readouterr().err,
         )
@@ -133,9 +125,11 @@ def test_no_message_denies_a_write_and_the_next_command_enters_it(
 
 @pytest.mark.parametrize("code", [errno.ENOSPC, errno.EIO])
 def test_an_audit_that_takes_no_entry_is_named_and_nothing_is_written(
-    cell: Path, code: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    cell_file: Path, code: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    controller, calibration, genuine = controller_of(cell), calibration_for(cell), os.write
+    controller = controller_of(cell_file)
+    calibration = calibration_for(cell_file)
+    genuine = os.write
     before = controller.read_bytes()
 
     def full(descriptor: int, data: bytes) -> int:
@@ -145,7 +139,7 @@ def test_an_audit_that_takes_no_entry_is_named_and_nothing_is_written(
         return genuine(descriptor, data)
 
     monkeypatch.setattr(os, "write", full)
-    assert apply(cell, calibration) == ExitCode.UNEXPECTED
+    assert apply(cell_file, calibration) == ExitCode.UNEXPECTED
     said = capsys.readouterr().err
     assert "demo.audit.jsonl" in said.splitlines()[0]
     assert "nothing was written to the controller" in said
@@ -153,7 +147,7 @@ def test_an_audit_that_takes_no_entry_is_named_and_nothing_is_written(
 
 
 def test_what_is_in_place_is_called_applied_by_the_audit(
-    cell: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    cell_file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The folder cannot be flushed, and the old content cannot be put back either."""
     genuine, renamed = os.replace, list[str]()
@@ -169,36 +163,36 @@ def test_what_is_in_place_is_called_applied_by_the_audit(
         if renamed:
             raise OSError(errno.EIO, os.strerror(errno.EIO))
 
-    calibration = calibration_for(cell)
+    calibration = calibration_for(cell_file)
     with monkeypatch.context() as patch:
         patch.setattr(os, "replace", once)
         patch.setattr("daq.files.fsync_folder", unflushed)
-        assert apply(cell, calibration) == ExitCode.UNEXPECTED
+        assert apply(cell_file, calibration) == ExitCode.UNEXPECTED
     error_output = capsys.readouterr().err
     said = " ".join(error_output.split())
     assert "has the new content, complete; the history lacks this write" in said
-    history = load_cell(cell).history
+    history = load_cell(cell_file).history
     assert history is not None
     actions = [entry.action for entry in read(history.audit)]
     assert actions == [
         AuditAction.APPLY_BEGUN,
         AuditAction.APPLIED,
     ]
-    assert main(["history", str(cell), "--verify"]) == ExitCode.DATA_UNFIT
-    assert main(["history", str(cell), "--add", str(calibration)]) == ExitCode.OK
-    assert main(["history", str(cell), "--verify"]) == ExitCode.OK
+    assert main(["history", str(cell_file), "--verify"]) == ExitCode.DATA_UNFIT
+    assert main(["history", str(cell_file), "--add", str(calibration)]) == ExitCode.OK
+    assert main(["history", str(cell_file), "--verify"]) == ExitCode.OK
 
 
 @pytest.mark.parametrize("flushed_before", [0, 1], ids=["backup", "controller's file"])
 def test_a_write_that_is_undone_after_a_flush_is_called_undone(
-    cell: Path,
+    cell_file: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
     flushed_before: int,
 ) -> None:
     """The folder cannot be flushed once: the old file is there, and no message doubts it."""
-    calibration = calibration_for(cell)
-    controller = load_cell(cell).controller_path
+    calibration = calibration_for(cell_file)
+    controller = load_cell(cell_file).controller_path
     assert controller is not None
     before = controller.read_bytes()
     flushed: list[Path] = []
@@ -209,7 +203,7 @@ def test_a_write_that_is_undone_after_a_flush_is_called_undone(
             raise OSError(errno.EIO, "Input/output error")
 
     monkeypatch.setattr("daq.files.fsync_folder", flush)
-    assert main(["apply", str(cell), str(calibration), "--yes"]) == ExitCode.UNEXPECTED
+    assert main(["apply", str(cell_file), str(calibration), "--yes"]) == ExitCode.UNEXPECTED
     assert controller.read_bytes() == before
     files = controller.parent.glob("*.bak")
     assert list(files) == []
