@@ -29,129 +29,169 @@ DRIVE_TRAIN = ident.DriveTrain(np.diag([40.0, 50.0, -45.0]))
 def short(small_truth: Truth) -> tuple[ident.Run, ident.Run]:
     """A run without load and one with, long enough for a fit."""
     rng = np.random.default_rng(7)
-    one, two = (
-        record(small_truth, name, rng, payload)
-        for name, payload in (("bare", None), ("loaded", MOUNTED))
-    )
-    return one, two
+    bare = record(small_truth, "bare", rng, None)
+    loaded = record(small_truth, "loaded", rng, MOUNTED)
+    return bare, loaded
 
 
 Change = Callable[[Any], Any]
 lax: Any = ident  #: As a notebook sees it
 
-OF_A_RUN: list[tuple[str, Change, str]] = [
-    (
-        "time of two columns",
-        lambda r: replace(r, time_s=r.time_s.reshape(-1, 2)),
-        r"'bare': time_s "
-        r".*\(n_samples,\)",
-    ),
-    (
-        "a rate for the time",
-        lambda r: replace(r, time_s=0.001),
-        r"'bare': time_s has shape "
-        r"\(\); expected",
-    ),
-    (
-        "a gap in time",
-        lambda r: replace(r, time_s=np.append(r.time_s[:-1], np.nan)),
-        "time_s holds 1 .* sample 4999;",
-    ),
-    (
-        "ragged time",
-        lambda r: replace(r, time_s=[[0.0], [0.1, 0.2]]),
-        "'bare': time_s is no array of numbers.*expected",
-    ),
-    (
-        "short time",
-        lambda r: replace(r, time_s=r.time_s[:-9]),
-        r"position_rad has shape \(\d+, "
-        r"3\); expected.*one row",
-    ),
-    (
-        "ragged positions",
-        lambda r: replace(r, position_rad=[[0.0] * 3, [0.1]]),
-        "'bare': position_rad is no array",
-    ),
-    (
-        "words",
-        lambda r: replace(r, current_a=[["one", "two", "three"]]),
-        "'bare': current_a is no array of numbers",
-    ),
-    (
-        "transposed",
-        lambda r: replace(r, position_rad=r.position_rad.T),
-        r"\(3, \d+\); expected .* "
-        r"transpose it\?",
-    ),
-    (
-        "complex currents",
-        lambda r: replace(r, current_a=r.current_a + 0.5j),
-        "'bare': current_a is of complex numbers .* expected real ones; give their real part",
-    ),
-    (
-        "masked positions",
-        lambda r: replace(
-            r, position_rad=np.ma.masked_array(r.position_rad, r.time_s[:, None] * [1, 1, 1] > 9.0)
-        ),
-        r"position_rad is a masked array with \d+ masked values; expected numbers; fill them",
-    ),
-    (
-        "objects",
-        lambda r: replace(r, current_a=np.array([[None, 1.0, "x"]] * len(r.time_s), dtype=object)),
-        "current_a is no array of numbers: it holds None of type NoneType; expected .* convert it",
-    ),
-    (
-        "numbers as text",
-        lambda r: replace(r, current_a=r.current_a.astype(str)),
-        "'bare': current_a is no array of numbers: its type is <U32",
-    ),
-    (
-        "complex temperatures",
-        lambda r: replace(r, temperature_c=r.current_a + 0.5j),
-        "'bare': temperature_c is of complex numbers",
-    ),
-    ("no position", lambda r: replace(r, position_rad=None), "'bare': position_rad .*expected"),
-    (
-        "valid of samples",
-        lambda r: replace(r, valid=np.ones(len(r.time_s))),
-        r"'bare': valid has "
-        r"shape .* "
-        r"expected \(",
-    ),
-    (
-        "few moves",
-        lambda r: replace(r, move=np.zeros(9)),
-        r"'bare': move has shape \(9,\); "
-        r"expected \(\d+,\)",
-    ),
-    (
-        "a mass for the payload",
-        lambda r: replace(r, payload=4.0),
-        "'bare' is of type float; expected Payload; write",
-    ),
-]
-
 
 @pytest.mark.parametrize(
-    ("change", "words"), [case[1:] for case in OF_A_RUN], ids=[case[0] for case in OF_A_RUN]
+    ("change", "words"),
+    [
+        pytest.param(
+            lambda r: replace(r, time_s=r.time_s.reshape(-1, 2)),
+            r"'bare': time_s .*\(n_samples,\)",
+            id="time of two columns",
+        ),
+        pytest.param(
+            lambda r: replace(r, time_s=0.001),
+            r"'bare': time_s has shape \(\); expected",
+            id="a rate for the time",
+        ),
+        pytest.param(
+            lambda r: replace(r, time_s=np.append(r.time_s[:-1], np.nan)),
+            "time_s holds 1 .* sample 4999;",
+            id="a gap in time",
+        ),
+        pytest.param(
+            lambda r: replace(r, time_s=[[0.0], [0.1, 0.2]]),
+            "'bare': time_s is no array of numbers.*expected",
+            id="ragged time",
+        ),
+        pytest.param(
+            lambda r: replace(r, time_s=r.time_s[:-9]),
+            r"position_rad has shape \(\d+, 3\); expected.*one row",
+            id="short time",
+        ),
+        pytest.param(
+            lambda r: replace(r, position_rad=[[0.0] * 3, [0.1]]),
+            "'bare': position_rad is no array",
+            id="ragged positions",
+        ),
+        pytest.param(
+            lambda r: replace(r, current_a=[["one", "two", "three"]]),
+            "'bare': current_a is no array of numbers",
+            id="words",
+        ),
+        pytest.param(
+            lambda r: replace(r, position_rad=r.position_rad.T),
+            r"\(3, \d+\); expected .* transpose it\?",
+            id="transposed",
+        ),
+        pytest.param(
+            lambda r: replace(r, current_a=r.current_a + 0.5j),
+            "'bare': current_a is of complex numbers .* expected real ones; give their real part",
+            id="complex currents",
+        ),
+        pytest.param(
+            lambda r: replace(
+                r,
+                position_rad=np.ma.masked_array(
+                    r.position_rad, r.time_s[:, None] * [1, 1, 1] > 9.0
+                ),
+            ),
+            r"position_rad is a masked array with \d+ masked values; expected numbers; fill them",
+            id="masked positions",
+        ),
+        pytest.param(
+            lambda r: replace(
+                r, current_a=np.array([[None, 1.0, "x"]] * len(r.time_s), dtype=object)
+            ),
+            "current_a is no array of numbers: it holds None of type NoneType; "
+            "expected .* convert it",
+            id="objects",
+        ),
+        pytest.param(
+            lambda r: replace(r, current_a=r.current_a.astype(str)),
+            "'bare': current_a is no array of numbers: its type is <U32",
+            id="numbers as text",
+        ),
+        pytest.param(
+            lambda r: replace(r, temperature_c=r.current_a + 0.5j),
+            "'bare': temperature_c is of complex numbers",
+            id="complex temperatures",
+        ),
+        pytest.param(
+            lambda r: replace(r, position_rad=None),
+            "'bare': position_rad .*expected",
+            id="no position",
+        ),
+        pytest.param(
+            lambda r: replace(r, valid=np.ones(len(r.time_s))),
+            r"'bare': valid has shape .* expected \(",
+            id="valid of samples",
+        ),
+        pytest.param(
+            lambda r: replace(r, move=np.zeros(9)),
+            r"'bare': move has shape \(9,\); expected \(\d+,\)",
+            id="few moves",
+        ),
+        pytest.param(
+            lambda r: replace(r, payload=4.0),
+            "'bare' is of type float; expected Payload; write",
+            id="a mass for the payload",
+        ),
+    ],
 )
-def test_a_run_that_is_none_is_refused(
+def test_identify_one_wrong_run_is_refused(
     small_truth: Truth, short: tuple[ident.Run, ident.Run], change: Change, words: str
 ) -> None:
+    bare, loaded = short
+    wrong = change(bare)
     with pytest.raises(ident.IdentificationError, match=words):
-        ident.identify(small_truth.model, [change(short[0]), short[1]], ident.Conditioning())
-
-
-IN_OTHER_UNITS: list[tuple[str, FloatArray]] = [
-    ("degrees", np.full(3, 180.0 / np.pi)),
-    ("degrees of one axis", np.array([1.0, 180.0 / np.pi, 1.0])),
-    ("angles of the motors", np.array([40.0, 50.0, -45.0])),
-]
+        ident.identify(small_truth.model, [wrong, loaded], ident.Conditioning())
 
 
 @pytest.mark.parametrize(
-    "factors", [case[1] for case in IN_OTHER_UNITS], ids=[case[0] for case in IN_OTHER_UNITS]
+    ("change", "words"),
+    [
+        pytest.param(
+            lambda r: replace(r, time_s=1000.0 * r.time_s),
+            r"'bare': time_s has 4 s between samples; expected seconds, .* divide them by 1000",
+            id="milliseconds",
+        ),
+        pytest.param(
+            lambda r: replace(r, started_s="monday"),
+            "started_s of 'bare' is 'monday' of type str; expected a finite number; leave it out",
+            id="a date as the beginning",
+        ),
+        pytest.param(
+            lambda r: replace(r, started_s=float("nan")),
+            "started_s of 'bare' is nan; expected a finite number",
+            id="NaN as the beginning",
+        ),
+        pytest.param(
+            lambda r: replace(r, current_a=1e-200 * r.current_a),
+            "'bare': current_a has .*e-2.. as the largest size on axis 1; expected amperes",
+            id="currents whose squares vanish",
+        ),
+        pytest.param(
+            lambda r: replace(r, current_a=1e200 * r.current_a),
+            r"'bare': current_a has .*e\+2.. as the largest size on axis 1; expected amperes",
+            id="currents whose squares overflow",
+        ),
+    ],
+)
+def test_identify_the_same_mistake_in_every_run_is_refused(
+    small_truth: Truth, short: tuple[ident.Run, ident.Run], change: Change, words: str
+) -> None:
+    runs = [change(run) for run in short]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with pytest.raises(ident.IdentificationError, match=words):
+            ident.identify(small_truth.model, runs)
+
+
+@pytest.mark.parametrize(
+    "factors",
+    [
+        pytest.param(np.full(3, 180.0 / np.pi), id="degrees"),
+        pytest.param(np.array([1.0, 180.0 / np.pi, 1.0]), id="degrees of one axis"),
+        pytest.param(np.array([40.0, 50.0, -45.0]), id="angles of the motors"),
+    ],
 )
 def test_angles_in_other_units_are_named_with_how_far_the_joint_turns(
     small_truth: Truth, short: tuple[ident.Run, ident.Run], factors: FloatArray
@@ -190,236 +230,229 @@ def test_a_range_or_current_of_a_robot_is_not_taken_for_other_units(
 
 Call = Callable[[Any, Any], Any]
 
-OF_A_CALL: list[tuple[str, Call, str]] = [
-    (
-        "one run",
-        lambda m, r: lax.identify(m, r[0], lax.Conditioning()),
-        r"type Run; .* give a "
-        r"list: \[bare, load",
-    ),
-    (
-        "one held out",
-        lambda m, r: lax.identify(m, r, lax.Conditioning(), holdout=r[0]),
-        "holdout .* give a list",
-    ),
-    (
-        "no run",
-        lambda m, _: lax.identify(m, [], lax.Conditioning()),
-        "^no run was given; expected one without load",
-    ),
-    (
-        "arrays",
-        lambda m, r: lax.identify(m, [r[0].time_s], lax.Conditioning()),
-        "type ndarray; expected Run; write",
-    ),
-    (
-        "a cut-off",
-        lambda m, r: lax.identify(m, r, 40.0),
-        "type float; expected Conditioning; write Conditioning",
-    ),
-    (
-        "one name",
-        lambda m, r: lax.identify(m, [r[0], r[0]]),
-        "'bare': found two runs of this name; expected another",
-    ),
-    (
-        "held out, too",
-        lambda m, r: lax.identify(m, r, holdout=[r[1]]),
-        "'loaded': found two runs of this name",
-    ),
-    (
-        "milliseconds",
-        lambda m, r: lax.identify(m, [replace(one, time_s=1000.0 * one.time_s) for one in r]),
-        r"'bare': time_s has 4 s between samples; expected seconds, .* divide them by 1000",
-    ),
-    (
-        "a tuple for a closure",
-        lambda *_: lax.robot_from_urdf(THREE_AXES.urdf, closures=[("loop", "a", "b", ("x",))]),
-        r"an entry of closures is of type tuple; expected LinkPair; write LinkPair\(name, first",
-    ),
-    (
-        "no motion",
-        lambda *_: lax.Motion(None, [[0.0]], [[0.0]]),
-        "position_rad of the motion is None; expected an arr",
-    ),
-    (
-        "no model",
-        lambda m, r: lax.identify(m.robot, r, lax.Conditioning()),
-        "type Robot; expected Model; write",
-    ),
-    (
-        "cut-off",
-        lambda m, r: lax.identify(m, r, lax.Conditioning(0.0)),
-        "'bare': .*cut-off of 0 Hz; expected above",
-    ),
-    (
-        "decimation",
-        lambda m, r: lax.identify(m, r, lax.Conditioning(decimation_cutoff_hz=-1)),
-        "of -1 Hz; expected",
-    ),
-    ("NaN", lambda m, r: lax.identify(m, r, lax.Conditioning(float("nan"))), "'bare': "),
-    (
-        "cut-off of text",
-        lambda m, r: lax.identify(m, r, lax.Conditioning("40")),
-        "position_cutoff_hz of the conditioning is of type str; expected Real; give a number",
-    ),
-    (
-        "share of text",
-        lambda m, r: lax.identify(m, r, lax.Conditioning(standstill_share=None)),
-        "standstill_share of the conditioning is of type NoneType; expected Real",
-    ),
-    (
-        "broken order",
-        lambda m, r: lax.identify(m, r, lax.Conditioning(position_order=2.5)),
-        "position_order of the conditioning is 2.5; expected a whole number",
-    ),
-    (
-        "order zero",
-        lambda m, r: lax.identify(m, r, lax.Conditioning(position_order=0)),
-        "position_order of the conditioning is 0; expected 1 to 10; 4 is usual",
-    ),
-    (
-        "order of hundreds",
-        lambda m, r: lax.identify(m, r, lax.Conditioning(position_order=500)),
-        "position_order of the conditioning is 500; expected 1 to 10",
-    ),
-    (
-        "a number as the name of a run",
-        lambda m, r: lax.identify(m, [replace(one, name=k) for k, one in enumerate(r)]),
-        r"name of a run is of type int; expected str; write Run\('bare'",
-    ),
-    (
-        "no name of one run",
-        lambda m, r: differentiate(replace(r[0], name=None), m.drive_train),
-        "name of a run is of type NoneType; expected str",
-    ),
-    (
-        "a date as the beginning",
-        lambda m, r: lax.identify(m, [replace(one, started_s="monday") for one in r]),
-        "started_s of 'bare' is 'monday' of type str; expected a finite number; leave it out",
-    ),
-    (
-        "NaN as the beginning",
-        lambda m, r: lax.identify(m, [replace(one, started_s=float("nan")) for one in r]),
-        "started_s of 'bare' is nan; expected a finite number",
-    ),
-    (
-        "currents whose squares vanish",
-        lambda m, r: lax.identify(m, [replace(one, current_a=1e-200 * one.current_a) for one in r]),
-        "'bare': current_a has .*e-2.. as the largest size on axis 1; expected amperes",
-    ),
-    (
-        "currents whose squares overflow",
-        lambda m, r: lax.identify(m, [replace(one, current_a=1e200 * one.current_a) for one in r]),
-        r"'bare': current_a has .*e\+2.. as the largest size on axis 1; expected amperes",
-    ),
-    ("no ratio", lambda *_: lax.DriveTrain(np.zeros((0, 0))), r"found shape \(0, 0\)"),
-    (
-        "half a character",
-        lambda *_: lax.robot_from_urdf("\ud800"),
-        "looks like a file name; expected text|the URDF cannot be read",
-    ),
-    (
-        "half a character in a URDF",
-        lambda *_: lax.robot_from_urdf("<robot name='\ud800'/>"),
-        "the URDF cannot be read: .*surrogates not allowed; expected XML",
-    ),
-    (
-        "no URDF",
-        lambda *_: lax.robot_from_urdf(None),
-        "the URDF is of type NoneType; expected text: pass Path",
-    ),
-    (
-        "a truth value as a mass",
-        lambda *_: lax.Payload("disc", "flange", {"m": True}),
-        r"known\['m'\] is True; expected a number; give numbers in SI units",
-    ),
-    (
-        "method",
-        lambda m, r: lax.identify(m, r, lax.Conditioning(), method="foo"),
-        "'foo'; expected one of ls, wls",
-    ),
-    (
-        "zero gain",
-        lambda m, r: _fixed(m, r, [30.0, 0.0, 20.0]),
-        r"fixed_gains is \[30.0, 0.0, 20.0\]; expected no zero",
-    ),
-    (
-        "NaN gain",
-        lambda m, r: _fixed(m, r, [30.0, float("nan"), 20.0]),
-        "fixed_gains holds 1 .* sample 1; give numbers",
-    ),
-    (
-        "a gain",
-        lambda m, r: _fixed(m, r, 30.0),
-        r"fixed_gains has shape \(\); expected \(3,\), one "
-        r"per motor",
-    ),
-    (
-        "words",
-        lambda m, r: _fixed(m, r, ["a", "b", "c"]),
-        r"fixed_gains is no array of "
-        r"numbers.*expected \(3,\)",
-    ),
-    (
-        "a mass",
-        lambda *_: lax.Payload("disc", "flange", 4.0),
-        "known is of type float; expected dict; write",
-    ),
-    (
-        "text",
-        lambda *_: lax.Payload("disc", "flange", {"m": "4"}),
-        r"known\['m'\] is of type str; "
-        r".* SI units",
-    ),
-    (
-        "URDF",
-        lambda *_: lax.Model(THREE_AXES.urdf, DRIVE_TRAIN),
-        r"type str; expected Robot; "
-        r".*robot_from_urdf\(",
-    ),
-    (
-        "ratios",
-        lambda m, _: lax.Model(m.robot, np.diag([40.0] * 3)),
-        r"ndarray; expected "
-        r"DriveTrain; .*np.diag\(",
-    ),
-    (
-        "vector",
-        lambda *_: lax.DriveTrain([100, -50]),
-        r"found shape \(2,\); write "
-        r"np.diag\(gear_ratios",
-    ),
-    (
-        "ragged",
-        lambda *_: lax.DriveTrain([[1.0], [1.0, 2.0]]),
-        "the drive train is no array of numbers.*expected",
-    ),
-    (
-        "file name",
-        lambda *_: lax.robot_from_urdf("robot.urdf"),
-        r"looks like a file name; .* pass "
-        r"Path\(...\).read_te",
-    ),
-    (
-        "path",
-        lambda *_: lax.robot_from_urdf(Path("robot.urdf")),
-        "'robot.urdf'.* looks like a file name; expected",
-    ),
-    (
-        "plan",
-        lambda *_: lax.planned(lax.Motion([["a"]], [[0.0]], [[0.0]]), 9.0),
-        "position_rad of the motion is no array of",
-    ),
-]
 
-
-def _fixed(model: ident.Model, runs: list[ident.Run], gains: Any) -> ident.Identification:
-    return ident.identify(model, runs, ident.Conditioning(), fixed_gains=gains)
+@pytest.mark.parametrize(
+    ("setting", "value", "words"),
+    [
+        pytest.param(
+            "position_cutoff_hz", 0.0, "'bare': .*cut-off of 0 Hz; expected above", id="cut-off"
+        ),
+        pytest.param("decimation_cutoff_hz", -1, "of -1 Hz; expected", id="decimation"),
+        pytest.param("position_cutoff_hz", float("nan"), "'bare': ", id="NaN"),
+        pytest.param(
+            "position_cutoff_hz",
+            "40",
+            "position_cutoff_hz of the conditioning is of type str; expected Real; give a number",
+            id="cut-off of text",
+        ),
+        pytest.param(
+            "standstill_share",
+            None,
+            "standstill_share of the conditioning is of type NoneType; expected Real",
+            id="share of text",
+        ),
+        pytest.param(
+            "position_order",
+            2.5,
+            "position_order of the conditioning is 2.5; expected a whole number",
+            id="broken order",
+        ),
+        pytest.param(
+            "position_order",
+            0,
+            "position_order of the conditioning is 0; expected 1 to 10; 4 is usual",
+            id="order zero",
+        ),
+        pytest.param(
+            "position_order",
+            500,
+            "position_order of the conditioning is 500; expected 1 to 10",
+            id="order of hundreds",
+        ),
+    ],
+)
+def test_identify_a_wrong_setting_of_the_conditioning_is_refused(
+    small_truth: Truth,
+    short: tuple[ident.Run, ident.Run],
+    setting: str,
+    value: Any,
+    words: str,
+) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with pytest.raises(ident.IdentificationError, match=words):
+            lax.identify(small_truth.model, list(short), lax.Conditioning(**{setting: value}))
 
 
 @pytest.mark.parametrize(
-    ("call", "words"), [case[1:] for case in OF_A_CALL], ids=[case[0] for case in OF_A_CALL]
+    ("gains", "words"),
+    [
+        pytest.param(
+            [30.0, 0.0, 20.0],
+            r"fixed_gains is \[30.0, 0.0, 20.0\]; expected no zero",
+            id="zero gain",
+        ),
+        pytest.param(
+            [30.0, float("nan"), 20.0],
+            "fixed_gains holds 1 .* sample 1; give numbers",
+            id="NaN gain",
+        ),
+        pytest.param(
+            30.0, r"fixed_gains has shape \(\); expected \(3,\), one per motor", id="a gain"
+        ),
+        pytest.param(
+            ["a", "b", "c"], r"fixed_gains is no array of numbers.*expected \(3,\)", id="words"
+        ),
+    ],
+)
+def test_identify_wrong_fixed_gains_are_refused(
+    small_truth: Truth, short: tuple[ident.Run, ident.Run], gains: Any, words: str
+) -> None:
+    conditioning = ident.Conditioning()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with pytest.raises(ident.IdentificationError, match=words):
+            ident.identify(small_truth.model, list(short), conditioning, fixed_gains=gains)
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        pytest.param(
+            lambda m, r: lax.identify(m, r[0], lax.Conditioning()),
+            r"type Run; .* give a list: \[bare, load",
+            id="one run",
+        ),
+        pytest.param(
+            lambda m, r: lax.identify(m, r, lax.Conditioning(), holdout=r[0]),
+            "holdout .* give a list",
+            id="one held out",
+        ),
+        pytest.param(
+            lambda m, _: lax.identify(m, [], lax.Conditioning()),
+            "^no run was given; expected one without load",
+            id="no run",
+        ),
+        pytest.param(
+            lambda m, r: lax.identify(m, [r[0].time_s], lax.Conditioning()),
+            "type ndarray; expected Run; write",
+            id="arrays",
+        ),
+        pytest.param(
+            lambda m, r: lax.identify(m, r, 40.0),
+            "type float; expected Conditioning; write Conditioning",
+            id="a cut-off",
+        ),
+        pytest.param(
+            lambda m, r: lax.identify(m, [r[0], r[0]]),
+            "'bare': found two runs of this name; expected another",
+            id="one name",
+        ),
+        pytest.param(
+            lambda m, r: lax.identify(m, r, holdout=[r[1]]),
+            "'loaded': found two runs of this name",
+            id="held out, too",
+        ),
+        pytest.param(
+            lambda *_: lax.robot_from_urdf(THREE_AXES.urdf, closures=[("loop", "a", "b", ("x",))]),
+            r"an entry of closures is of type tuple; expected LinkPair; "
+            r"write LinkPair\(name, first",
+            id="a tuple for a closure",
+        ),
+        pytest.param(
+            lambda *_: lax.Motion(None, [[0.0]], [[0.0]]),
+            "position_rad of the motion is None; expected an arr",
+            id="no motion",
+        ),
+        pytest.param(
+            lambda m, r: lax.identify(m.robot, r, lax.Conditioning()),
+            "type Robot; expected Model; write",
+            id="no model",
+        ),
+        pytest.param(
+            lambda m, r: lax.identify(m, [replace(one, name=k) for k, one in enumerate(r)]),
+            r"name of a run is of type int; expected str; write Run\('bare'",
+            id="a number as the name of a run",
+        ),
+        pytest.param(
+            lambda m, r: differentiate(replace(r[0], name=None), m.drive_train),
+            "name of a run is of type NoneType; expected str",
+            id="no name of one run",
+        ),
+        pytest.param(
+            lambda *_: lax.DriveTrain(np.zeros((0, 0))), r"found shape \(0, 0\)", id="no ratio"
+        ),
+        pytest.param(
+            lambda *_: lax.robot_from_urdf("\ud800"),
+            "looks like a file name; expected text|the URDF cannot be read",
+            id="half a character",
+        ),
+        pytest.param(
+            lambda *_: lax.robot_from_urdf("<robot name='\ud800'/>"),
+            "the URDF cannot be read: .*surrogates not allowed; expected XML",
+            id="half a character in a URDF",
+        ),
+        pytest.param(
+            lambda *_: lax.robot_from_urdf(None),
+            "the URDF is of type NoneType; expected text: pass Path",
+            id="no URDF",
+        ),
+        pytest.param(
+            lambda *_: lax.Payload("disc", "flange", {"m": True}),
+            r"known\['m'\] is True; expected a number; give numbers in SI units",
+            id="a truth value as a mass",
+        ),
+        pytest.param(
+            lambda m, r: lax.identify(m, r, lax.Conditioning(), method="foo"),
+            "'foo'; expected one of ls, wls",
+            id="method",
+        ),
+        pytest.param(
+            lambda *_: lax.Payload("disc", "flange", 4.0),
+            "known is of type float; expected dict; write",
+            id="a mass",
+        ),
+        pytest.param(
+            lambda *_: lax.Payload("disc", "flange", {"m": "4"}),
+            r"known\['m'\] is of type str; .* SI units",
+            id="text",
+        ),
+        pytest.param(
+            lambda *_: lax.Model(THREE_AXES.urdf, DRIVE_TRAIN),
+            r"type str; expected Robot; .*robot_from_urdf\(",
+            id="URDF",
+        ),
+        pytest.param(
+            lambda m, _: lax.Model(m.robot, np.diag([40.0] * 3)),
+            r"ndarray; expected DriveTrain; .*np.diag\(",
+            id="ratios",
+        ),
+        pytest.param(
+            lambda *_: lax.DriveTrain([100, -50]),
+            r"found shape \(2,\); write np.diag\(gear_ratios",
+            id="vector",
+        ),
+        pytest.param(
+            lambda *_: lax.DriveTrain([[1.0], [1.0, 2.0]]),
+            "the drive train is no array of numbers.*expected",
+            id="ragged",
+        ),
+        pytest.param(
+            lambda *_: lax.robot_from_urdf("robot.urdf"),
+            r"looks like a file name; .* pass Path\(...\).read_te",
+            id="file name",
+        ),
+        pytest.param(
+            lambda *_: lax.robot_from_urdf(Path("robot.urdf")),
+            "'robot.urdf'.* looks like a file name; expected",
+            id="path",
+        ),
+        pytest.param(
+            lambda *_: lax.planned(lax.Motion([["a"]], [[0.0]], [[0.0]]), 9.0),
+            "position_rad of the motion is no array of",
+            id="plan",
+        ),
+    ],
 )
 def test_an_argument_of_another_kind_is_refused(
     small_truth: Truth, short: tuple[ident.Run, ident.Run], call: Call, words: str
@@ -440,9 +473,8 @@ def test_runs_of_different_logs_may_have_one_name(
     changed_bare = replace(bare, digest="a" * 64)
     of_logs = [changed_bare, changed_loaded]
     same = ident.identify(small_truth.model, of_logs)
-    assert np.array_equal(
-        same.estimate.gains, ident.identify(small_truth.model, short).estimate.gains
-    )
+    expected = ident.identify(small_truth.model, short)
+    assert np.array_equal(same.estimate.gains, expected.estimate.gains)
 
 
 def test_a_method_may_be_named(small_truth: Truth, short: tuple[ident.Run, ident.Run]) -> None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import numpy as np
 
@@ -37,62 +37,108 @@ def _viscous_nm_s_rad(axis: AxisSpec) -> float:
     return axis.viscous_nm_s_rad + axis.motor_viscous_nm_s_rad
 
 
+def _stribeck(axis: AxisSpec, size: float, rng: np.random.Generator) -> dict[str, float]:
+    rise_nm = 0.55 * size * _dry_nm(axis)
+    speed_rad_s = float(rng.uniform(0.15, 0.3))
+    return {"rise_nm": rise_nm, "speed_rad_s": speed_rad_s}
+
+
 def _nonlinear(axis: AxisSpec, size: float, rng: np.random.Generator) -> dict[str, float]:
     exponent = float(rng.choice([1 / 3, 2.0]))
+    if exponent < 1.0:
+        share = 0.7
+    else:
+        share = 0.3
+    torque_nm = share * size * _dry_nm(axis)
+    return {"torque_at_1_rad_s_nm": torque_nm, "exponent": exponent}
+
+
+def _asymmetric(axis: AxisSpec, size: float, _: np.random.Generator) -> dict[str, float]:
+    share = min(0.9, 0.45 * size)
+    return {"coefficient_nm_s_rad": share * _viscous_nm_s_rad(axis)}
+
+
+def _load_friction(_: AxisSpec, size: float, __: np.random.Generator) -> dict[str, float]:
+    return {"coefficient": 0.1 * size}
+
+
+def _warm_up(_: AxisSpec, size: float, rng: np.random.Generator) -> dict[str, float]:
+    time_constant_s = float(rng.uniform(40.0, 100.0))
+    return {"cold_fraction": 0.6 * size, "time_constant_s": time_constant_s}
+
+
+def _presliding(axis: AxisSpec, size: float, rng: np.random.Generator) -> dict[str, float]:
+    torque_nm = min(0.95, 0.8 * size) * axis.coulomb_nm
+    distance_rad = float(rng.uniform(0.04, 0.1))
+    return {"torque_nm": torque_nm, "distance_rad": distance_rad}
+
+
+def _backlash(axis: AxisSpec, size: float, _: np.random.Generator) -> dict[str, float]:
+    inertia_kg_m2 = axis.motor_inertia_kg_m2
     return {
-        "torque_at_1_rad_s_nm": (0.7 if exponent < 1.0 else 0.3) * size * _dry_nm(axis),
-        "exponent": exponent,
+        "gap_rad": 0.0045 * size,
+        "stiffness_nm_per_rad": 150_000.0 * inertia_kg_m2,
+        "damping_nm_s_per_rad": 300.0 * inertia_kg_m2,
     }
 
 
+def _elasticity(axis: AxisSpec, size: float, _: np.random.Generator) -> dict[str, float]:
+    inertia_kg_m2 = axis.motor_inertia_kg_m2
+    return {
+        "stiffness_nm_per_rad": 45_000.0 * inertia_kg_m2 / size,
+        "damping_nm_s_per_rad": 200.0 * inertia_kg_m2,
+    }
+
+
+def _spring(axis: AxisSpec, size: float, rng: np.random.Generator) -> dict[str, float]:
+    stiffness_nm_per_rad = 1.3 * size * _dry_nm(axis)
+    rest_rad = float(rng.uniform(-1.0, 1.0))
+    return {"stiffness_nm_per_rad": stiffness_nm_per_rad, "rest_rad": rest_rad}
+
+
+def _position_friction(axis: AxisSpec, size: float, rng: np.random.Generator) -> dict[str, float]:
+    amplitude_nm = 0.33 * size * _dry_nm(axis)
+    phase_rad = float(rng.uniform(-math.pi, math.pi))
+    return {"amplitude_nm": amplitude_nm, "phase_rad": phase_rad}
+
+
+def _cogging(axis: AxisSpec, size: float, rng: np.random.Generator) -> dict[str, float]:
+    amplitude_nm = 0.5 * size * _dry_nm(axis)
+    order = float(rng.choice([1, 2, 3, 4, 6]))
+    phase_rad = float(rng.uniform(-math.pi, math.pi))
+    return {"amplitude_nm": amplitude_nm, "order": order, "phase_rad": phase_rad}
+
+
+def _saturation(axis: AxisSpec, size: float, _: np.random.Generator) -> dict[str, float]:
+    half_current_a = 4.2 * axis.rated_current_a / math.sqrt(size)
+    return {"half_current_a": half_current_a}
+
+
+def _lag(_: AxisSpec, size: float, __: np.random.Generator) -> dict[str, float]:
+    return {"time_constant_s": 0.008 * size}
+
+
+def _coupling(axis: AxisSpec, size: float, _: np.random.Generator) -> dict[str, float]:
+    coulomb_nm = 0.35 * size * _dry_nm(axis)
+    viscous_nm_s_rad = 0.5 * size * _viscous_nm_s_rad(axis)
+    return {"coulomb_nm": coulomb_nm, "viscous_nm_s_rad": viscous_nm_s_rad}
+
+
 FAMILIES: dict[str, Draw] = {
-    "stribeck": lambda axis, size, rng: {
-        "rise_nm": 0.55 * size * _dry_nm(axis),
-        "speed_rad_s": float(rng.uniform(0.15, 0.3)),
-    },
+    "stribeck": _stribeck,
     "nonlinear-viscous": _nonlinear,
-    "asymmetric-viscous": lambda axis, size, _: {
-        "coefficient_nm_s_rad": min(0.9, 0.45 * size) * _viscous_nm_s_rad(axis)
-    },
-    "load-friction": lambda _, size, __: {"coefficient": 0.1 * size},
-    "warm-up": lambda _, size, rng: {
-        "cold_fraction": 0.6 * size,
-        "time_constant_s": float(rng.uniform(40.0, 100.0)),
-    },
-    "presliding": lambda axis, size, rng: {
-        "torque_nm": min(0.95, 0.8 * size) * axis.coulomb_nm,
-        "distance_rad": float(rng.uniform(0.04, 0.1)),
-    },
-    "backlash": lambda axis, size, _: {
-        "gap_rad": 0.0045 * size,
-        "stiffness_nm_per_rad": 150_000.0 * axis.motor_inertia_kg_m2,
-        "damping_nm_s_per_rad": 300.0 * axis.motor_inertia_kg_m2,
-    },
-    "elasticity": lambda axis, size, _: {
-        "stiffness_nm_per_rad": 45_000.0 * axis.motor_inertia_kg_m2 / size,
-        "damping_nm_s_per_rad": 200.0 * axis.motor_inertia_kg_m2,
-    },
-    "spring": lambda axis, size, rng: {
-        "stiffness_nm_per_rad": 1.3 * size * _dry_nm(axis),
-        "rest_rad": float(rng.uniform(-1.0, 1.0)),
-    },
-    "position-friction": lambda axis, size, rng: {
-        "amplitude_nm": 0.33 * size * _dry_nm(axis),
-        "phase_rad": float(rng.uniform(-math.pi, math.pi)),
-    },
-    "cogging": lambda axis, size, rng: {
-        "amplitude_nm": 0.5 * size * _dry_nm(axis),
-        "order": float(rng.choice([1, 2, 3, 4, 6])),
-        "phase_rad": float(rng.uniform(-math.pi, math.pi)),
-    },
-    "saturation": lambda axis, size, _: {
-        "half_current_a": 4.2 * axis.rated_current_a / math.sqrt(size)
-    },
-    "lag": lambda _, size, __: {"time_constant_s": 0.008 * size},
-    "coupling": lambda axis, size, _: {
-        "coulomb_nm": 0.35 * size * _dry_nm(axis),
-        "viscous_nm_s_rad": 0.5 * size * _viscous_nm_s_rad(axis),
-    },
+    "asymmetric-viscous": _asymmetric,
+    "load-friction": _load_friction,
+    "warm-up": _warm_up,
+    "presliding": _presliding,
+    "backlash": _backlash,
+    "elasticity": _elasticity,
+    "spring": _spring,
+    "position-friction": _position_friction,
+    "cogging": _cogging,
+    "saturation": _saturation,
+    "lag": _lag,
+    "coupling": _coupling,
 }
 """Parameters of every family of the simulated plant; `coupling` gets its other joint besides."""
 
@@ -106,30 +152,43 @@ def blind_cases(seed: int, count: int) -> tuple[EffectCase, ...]:
     clean = load_simulation(shipped_simulation("clean"))
     cases = []
     for number in range(count):
-        rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(number,)))
+        sequence = np.random.SeedSequence(seed, spawn_key=(number,))
+        rng = np.random.default_rng(sequence)
         truth = int(rng.integers(10_000, 2**31))
-        while True:
-            effects = tuple(
-                _drawn(clean.axes, rng)
-                for _ in range(rng.choice(len(EFFECT_COUNTS), p=EFFECT_COUNTS))
-            )
-            if len({(effect.name, effect.axis) for effect in effects}) < len(effects):
-                continue
-            case = EffectCase(f"blind-{seed}-{number:02d}", truth, effects)
-            try:
-                spec = case.spec("measurement", None, 0)
-                Plant(spec)
-            except SpecInvalid:  # two flexible drives on one motor
-                continue
-            break
+        name = f"blind-{seed}-{number:02d}"
+        case = None
+        while case is None or not _can_be_built(case):
+            effects = _drawn_effects(clean.axes, rng)
+            case = EffectCase(name, truth, effects)
         cases.append(case)
     return tuple(cases)
+
+
+def _can_be_built(case: EffectCase) -> bool:
+    """Whether no effect is on its axis twice, and no motor has two flexible drives."""
+    places = {(effect.name, effect.axis) for effect in case.effects}
+    if len(places) < len(case.effects):
+        return False
+    try:
+        spec = case.spec("measurement", None, 0)
+        Plant(spec)
+    except SpecInvalid:
+        return False
+    return True
+
+
+def _drawn_effects(
+    axes: Sequence[AxisSpec], rng: np.random.Generator
+) -> tuple[UndeclaredEffect, ...]:
+    count = rng.choice(len(EFFECT_COUNTS), p=EFFECT_COUNTS)
+    return tuple(_drawn(axes, rng) for _ in range(count))
 
 
 def _drawn(axes: Sequence[AxisSpec], rng: np.random.Generator) -> UndeclaredEffect:
     name = str(rng.choice(list(FAMILIES)))
     axis = int(rng.integers(len(axes)))
-    size = float(np.exp(rng.uniform(*np.log(SIZE))))
+    logarithm = rng.uniform(*np.log(SIZE))
+    size = float(np.exp(logarithm))
     if name == "coupling":
         axis = max(axis, 1)
     parameters = FAMILIES[name](axes[axis], size, rng)
@@ -149,29 +208,48 @@ def confusion(cells: Sequence[tuple[tuple[str, ...], tuple[str, ...]]]) -> str:
     """
     pairs: Counter[tuple[str, str]] = Counter()
     for true, named in cells:
-        missed = [one for one in true if one not in named]
-        spare = [one for one in named if one not in true]
-        for one in set(true) & set(named):
-            pairs[_family(one), _family(one)] += 1
-        for one in missed:
-            other = next((name for name in spare if set(_axes(name)) & set(_axes(one))), None)
-            if other is not None:
-                spare.remove(other)
-            pairs[_family(one), NOTHING if other is None else _family(other)] += 1
-        for one in spare:
-            pairs[NOTHING, _family(one)] += 1
-    rows, columns = (
-        sorted({pair[side] for pair in pairs}, key=lambda name: (name == NOTHING, name))
-        for side in (0, 1)
-    )
-    lines = ["| true \\ named | " + " | ".join(columns) + " |", "|---" * (len(columns) + 1) + "|"]
-    texts = ([str(pairs[row, column] or "") for column in columns] for row in rows)
-    return "\n".join(
-        [
-            *lines,
-            *(f"| {row} | {' | '.join(cells)} |" for row, cells in zip(rows, texts, strict=True)),
-        ]
-    )
+        pairs.update(_pairs_of(true, named))
+    true_families = {true for true, _ in pairs}
+    named_families = {named for _, named in pairs}
+    columns = _nothing_last(named_families)
+    headings = " | ".join(columns)
+    lines = [f"| true \\ named | {headings} |"]
+    lines.append("|---" * (len(columns) + 1) + "|")
+    for row in _nothing_last(true_families):
+        counts = [str(pairs[row, column] or "") for column in columns]
+        joined_counts = " | ".join(counts)
+        lines.append(f"| {row} | {joined_counts} |")
+    return "\n".join(lines)
+
+
+def _pairs_of(true: Sequence[str], named: Sequence[str]) -> Iterator[tuple[str, str]]:
+    """Families of each true effect of a cell and of what was named for it."""
+    missed = [one for one in true if one not in named]
+    spare = [one for one in named if one not in true]
+    for found in set(true) & set(named):
+        yield _family(found), _family(found)
+    for one in missed:
+        taken = _on_an_axis_of(one, spare)
+        if taken is None:
+            yield _family(one), NOTHING
+        else:
+            spare.remove(taken)
+            yield _family(one), _family(taken)
+    for one in spare:
+        yield NOTHING, _family(one)
+
+
+def _on_an_axis_of(effect: str, others: Iterable[str]) -> str | None:
+    """The first of the others that is on an axis of this effect."""
+    axes = set(_axes(effect))
+    for other in others:
+        if not axes.isdisjoint(_axes(other)):
+            return other
+    return None
+
+
+def _nothing_last(families: Iterable[str]) -> list[str]:
+    return sorted(families, key=lambda family: (family == NOTHING, family))
 
 
 def _family(placed: str) -> str:

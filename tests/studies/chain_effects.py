@@ -104,15 +104,22 @@ def study_effect(planted: PlantedEffect, seed: int, folder: Path) -> dict[str, A
     added = []
     for turn in found["turns"]:
         added.extend(turn["added"])
-    sizes = []
-    for one in added:
-        if (one["effect"], one["axis"]) == wanted:
-            for coefficient in one["coefficients"]:
-                if coefficient["name"] == planted.coefficient:
-                    sizes.append(coefficient)
-    changes = {one["axis"]: one for one in found["gain_changes"]}
-    sorted_differences = sorted(kept - {wanted})
-    total = found["before"]["cross_validated_error_percent"]["total"]
+    added_places = [(one["effect"], one["axis"]) for one in added]
+    size = _last_size(planted, added)
+    others = sorted(kept - {wanted})
+    before = found["before"]["cross_validated_error_percent"]
+    after = found["after"]["cross_validated_error_percent"]
+    changes: dict[str, float] = {}
+    errors_before: dict[str, float] = {}
+    errors_after: dict[str, float] = {}
+    stds_after: dict[str, float] = {}
+    for change in found["gain_changes"]:
+        axis = change["axis"]
+        truth = job.truth[axis]
+        changes[axis] = change["change_percent"]
+        errors_before[axis] = 100.0 * (change["before"] / truth - 1.0)
+        errors_after[axis] = 100.0 * (change["after"] / truth - 1.0)
+        stds_after[axis] = 100.0 * change["after_std"] / abs(truth)
     return {
         "robot": planted.robot,
         "seed": seed,
@@ -120,25 +127,31 @@ def study_effect(planted: PlantedEffect, seed: int, folder: Path) -> dict[str, A
         "place": planted.place,
         "size": planted.size,
         "named": wanted in kept,
-        "named_first": bool(added) and (added[0]["effect"], added[0]["axis"]) == wanted,
-        "found_size": sizes[-1]["value"] if sizes else None,
-        "found_size_std": sizes[-1]["std"] if sizes else None,
-        "others": [f"{name} on {place}" for name, place in sorted_differences],
+        "named_first": added_places[:1] == [wanted],
+        "found_size": size["value"],
+        "found_size_std": size["std"],
+        "others": [f"{name} on {place}" for name, place in others],
         "added": added,
-        "error_before_percent": total,
-        "error_after_percent": found["after"]["cross_validated_error_percent"]["total"],
-        "gain_change_percent": {axis: one["change_percent"] for axis, one in changes.items()},
-        "gain_error_before_percent": {
-            a: 100.0 * (one["before"] / job.truth[a] - 1.0) for a, one in changes.items()
-        },
-        "gain_error_after_percent": {
-            a: 100.0 * (one["after"] / job.truth[a] - 1.0) for a, one in changes.items()
-        },
-        "gain_std_after_percent": {
-            a: 100.0 * one["after_std"] / abs(job.truth[a]) for a, one in changes.items()
-        },
+        "error_before_percent": before["total"],
+        "error_after_percent": after["total"],
+        "gain_change_percent": changes,
+        "gain_error_before_percent": errors_before,
+        "gain_error_after_percent": errors_after,
+        "gain_std_after_percent": stds_after,
         "summary": found["summary"],
     }
+
+
+def _last_size(planted: PlantedEffect, added: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Value and σ of the planted effect's parameter in the last turn that added the effect."""
+    size = {"value": None, "std": None}
+    for one in added:
+        if (one["effect"], one["axis"]) != (planted.name, planted.place):
+            continue
+        for coefficient in one["coefficients"]:
+            if coefficient["name"] == planted.coefficient:
+                size = coefficient
+    return size
 
 
 def kept_effect(planted: PlantedEffect, seed: int, out: Path) -> dict[str, Any]:
@@ -160,15 +173,16 @@ def table_of_effects(rows: Sequence[dict[str, Any]]) -> str:
             size = f"{row['found_size']:.3g} ± {row['found_size_std']:.2g}"
         else:
             size = "not named"
+        effect = f"{row['effect']} on {row['place']}"
+        if row["named_first"]:
+            first = "yes"
+        else:
+            first = "no"
+        others = ", ".join(row["others"]) or "none"
         errors = f"{row['error_before_percent']:.2f} → {row['error_after_percent']:.2f}"
-        worst = (
-            max(map(abs, row[f"gain_error_{when}_percent"].values()))
-            for when in ("before", "after")
-        )
-        gains = " → ".join(f"{error:.2f}" for error in worst)
-        lines.append(
-            f"| {row['robot']} | {row['effect']} on {row['place']} | {row['size']:g} | {size} | "
-            f"{'yes' if row['named_first'] else 'no'} | {', '.join(row['others']) or 'none'} | "
-            f"{errors} | {gains} |"
-        )
+        worst_before = max(map(abs, row["gain_error_before_percent"].values()))
+        worst_after = max(map(abs, row["gain_error_after_percent"].values()))
+        gains = f"{worst_before:.2f} → {worst_after:.2f}"
+        identity = f"| {row['robot']} | {effect} | {row['size']:g} "
+        lines.append(f"{identity}| {size} | {first} | {others} | {errors} | {gains} |")
     return "\n".join(lines)

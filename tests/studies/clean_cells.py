@@ -31,56 +31,60 @@ def one(seed: int) -> dict[str, Any]:
     paper = outcome.fitted.paper
     assert paper is not None  # no gain is held fixed
     ml = [gain.error_percent for gain in gains]
-    tls = [
-        100.0 * (value / gain.truth - 1.0)
-        for gain, value in zip(gains, paper.gains.tolist(), strict=True)
-    ]
+    tls = []
+    for gain, value in zip(gains, paper.gains.tolist(), strict=True):
+        error_percent = 100.0 * (value / gain.truth - 1.0)
+        tls.append(error_percent)
+    scores = []
+    for gain in gains:
+        if gain.std_percent is not None:
+            scores.append(gain.error_percent / gain.std_percent)
     total = outcome.calibration.relative_error_percent.total
     return {
         "seed": seed,
         "floor_percent": total,
         "ml_error_percent": ml,
         "tls_error_percent": tls,
-        "scores": [
-            gain.error_percent / gain.std_percent for gain in gains if gain.std_percent is not None
-        ],
+        "scores": scores,
         "effects": [effect.name for effect in outcome.calibration.effects],
     }
+
+
+def error_sizes(rows: list[dict[str, Any]], key: str) -> dict[str, float]:
+    """Mean and largest size of the gain errors of all rows [%]."""
+    sizes: list[float] = []
+    for row in rows:
+        sizes.extend(abs(error) for error in row[key])
+    return {"mean_percent": sum(sizes) / len(sizes), "max_percent": max(sizes)}
 
 
 def main() -> int:
     """All seeds, two at a time."""
     with multiprocessing.get_context("spawn").Pool(2) as pool:
         rows = pool.map(one, SEEDS, chunksize=1)
-    ml = [abs(error) for row in rows for error in row["ml_error_percent"]]
-    tls = [abs(error) for row in rows for error in row["tls_error_percent"]]
     sizes = {
-        name: {"mean_percent": sum(e) / len(e), "max_percent": max(e)}
-        for name, e in (("ml", ml), ("tls", tls))
+        "ml": error_sizes(rows, "ml_error_percent"),
+        "tls": error_sizes(rows, "tls_error_percent"),
     }
     false_effects = sum(len(row["effects"]) for row in rows)
     result = {"runs": rows, **sizes, "false_effects": false_effects}
     text = json.dumps(result, indent=2)
     OUT.with_suffix(".json").write_text(text + "\n")
-    lines = [
-        "| seed | "
-        "floor % | " + " | ".join(f"J{n + 1} %" for n in range(6)) + " | paper's TLS, mean / max % "
-        "| effects |"
-    ]
+    joints = " | ".join(f"J{n + 1} %" for n in range(6))
+    lines = [f"| seed | floor % | {joints} | paper's TLS, mean / max % | effects |"]
     lines.append("|---" * 10 + "|")
     for row in rows:
+        floor = f"{row['floor_percent']:.2f}"
         gains = " | ".join(f"{error:+.2f}" for error in row["ml_error_percent"])
-        paper_errors = [abs(error) for error in row["tls_error_percent"]]
-        paper = f"{sum(paper_errors) / len(paper_errors):.1f} / {max(paper_errors):.1f}"
-        lines.append(
-            f"| {row['seed']} | {row['floor_percent']:.2f} | {gains} | {paper} | "
-            f"{len(row['effects'])} |"
-        )
+        paper_size = error_sizes([row], "tls_error_percent")
+        paper = f"{paper_size['mean_percent']:.1f} / {paper_size['max_percent']:.1f}"
+        effect_count = len(row["effects"])
+        lines.append(f"| {row['seed']} | {floor} | {gains} | {paper} | {effect_count} |")
     lines.append("")
-    lines += [
-        f"{name}: mean {size['mean_percent']:.2f} %, max {size['max_percent']:.2f} %"
-        for name, size in sizes.items()
-    ]
+    for name, size in sizes.items():
+        mean = f"mean {size['mean_percent']:.2f} %"
+        largest = f"max {size['max_percent']:.2f} %"
+        lines.append(f"{name}: {mean}, {largest}")
     lines.append(f"effects found in clean cells: {false_effects}")
     sys.stdout.write("\n".join(lines) + "\n")
     return 0

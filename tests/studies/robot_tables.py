@@ -14,37 +14,13 @@ from typing import Any
 
 from daq.files import replace_file
 
-SUMMARY = (
-    "robot",
-    "gains",
-    "relative error",
-    "gain error mean",
-    "worst",
-    "second payload mean",
-    "worst",
-    "coverage",
-)
-GAINS = (
-    "robot",
-    "axis",
-    "unit",
-    "nameplate",
-    "identified",
-    "%σ",
-    "%e from the nameplate",
-    "%e from the truth",
-)
-PAYLOADS = (
-    "robot",
-    "first payload [kg]",
-    "identified",
-    "%σ",
-    "%e",
-    "second payload [kg]",
-    "identified",
-    "%σ",
-    "%e",
-)
+_ERRORS = ("identified", "%σ", "%e")
+_GAIN_ERRORS = ("identified", "%σ", "%e from the nameplate", "%e from the truth")
+_SUMMARY_ERRORS = ("relative error", "gain error mean", "worst", "second payload mean", "worst")
+
+SUMMARY = ("robot", "gains", *_SUMMARY_ERRORS, "coverage")
+GAINS = ("robot", "axis", "unit", "nameplate", *_GAIN_ERRORS)
+PAYLOADS = ("robot", "first payload [kg]", *_ERRORS, "second payload [kg]", *_ERRORS)
 
 
 def write_tables(
@@ -58,26 +34,32 @@ def write_tables(
         rows: of all seeds; the gains are those of each robot's first.
     """
     first = {row["robot"]: row for row in reversed(rows)}
-    tables = {
-        "robots.csv": (SUMMARY, [_summary(robot) for robot in figures]),
-        "robots-gains.csv": (
-            GAINS,
-            [line for robot in figures for line in _gains(first[robot["robot"]])],
-        ),
-        "robots-payloads.csv": (PAYLOADS, [_payloads(first[robot["robot"]]) for robot in figures]),
-    }
-    for name, (headings, lines) in tables.items():
-        text = io.StringIO()
-        csv.writer(text, lineterminator="\n").writerows([headings, *lines])
-        content = text.getvalue().encode()
-        replace_file(folder / name, content)
+    summary: list[tuple[str, ...]] = []
+    gains: list[tuple[str, ...]] = []
+    payloads: list[tuple[str, ...]] = []
+    for robot in figures:
+        first_seed = first[robot["robot"]]
+        summary.append(_summary(robot))
+        gains.extend(_gains(first_seed))
+        payloads.append(_payloads(first_seed))
+    _write_csv(folder / "robots.csv", SUMMARY, summary)
+    _write_csv(folder / "robots-gains.csv", GAINS, gains)
+    _write_csv(folder / "robots-payloads.csv", PAYLOADS, payloads)
+
+
+def _write_csv(path: Path, headings: tuple[str, ...], lines: list[tuple[str, ...]]) -> None:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(headings)
+    writer.writerows(lines)
+    content = text.getvalue().encode()
+    replace_file(path, content)
 
 
 def _summary(robot: dict[str, Any]) -> tuple[str, ...]:
-    gains_text = str(robot["gains"])
     return (
         robot["robot"],
-        gains_text,
+        str(robot["gains"]),
         f"{robot['floor_percent']:.1f}",
         f"{robot['mean_gain_error_percent']:.2f}",
         f"{robot['worst_gain_error_percent']:.2f}",
@@ -93,14 +75,15 @@ def _gains(row: dict[str, Any]) -> Iterable[tuple[str, ...]]:
         true = row["true_gain"][axis]
         identified = true * (1.0 + error / 100.0)
         change = 100.0 * abs(identified / nameplate - 1.0)
+        # σ is kept in percent of the truth.
+        std_percent = row["gain_std_percent"][axis] * abs(true / identified)
         yield (
             row["robot"],
             axis,
             row["gain_unit"][axis],
             f"{nameplate:.4g}",
             f"{identified:.4g}",
-            # σ is kept in percent of the truth.
-            f"{row['gain_std_percent'][axis] * abs(true / identified):.2f}",
+            f"{std_percent:.2f}",
             f"{change:.2f}",
             f"{abs(error):.2f}",
         )
@@ -109,13 +92,12 @@ def _gains(row: dict[str, Any]) -> Iterable[tuple[str, ...]]:
 def _payloads(row: dict[str, Any]) -> tuple[str, ...]:
     cells = [row["robot"]]
     for role in ("first_payload", "payload"):
-        true, error, std = (
-            row[f"{role}_{what}"] for what in ("kg", "error_percent", "std_percent")
-        )
-        cells += [
-            f"{true:g}",
-            f"{true * (1.0 + error / 100.0):.4g}",
-            f"{std:.2f}",
-            f"{abs(error):.2f}",
-        ]
+        true_kg = row[f"{role}_kg"]
+        error_percent = row[f"{role}_error_percent"]
+        std_percent = row[f"{role}_std_percent"]
+        identified_kg = true_kg * (1.0 + error_percent / 100.0)
+        cells.append(f"{true_kg:g}")
+        cells.append(f"{identified_kg:.4g}")
+        cells.append(f"{std_percent:.2f}")
+        cells.append(f"{abs(error_percent):.2f}")
     return tuple(cells)
