@@ -192,12 +192,14 @@ def test_an_axis_that_falls_silent_stops_the_others_and_is_shouted() -> None:
     assert outcome.restored_axes == tuple(axis for axis in range(6) if axis != AXIS)
 
 
+@pytest.mark.slow
 def test_an_axis_that_is_cut_off_stops_by_itself_since_it_hears_no_recorder() -> None:
     outcome = run("guarded", at(FaultKind.SILENT), guard_ms=GUARD_MS, afterwards=2 * GUARD_MS)
     assert isinstance(outcome.error, SampleLost)
     assert set(outcome.states) == {PowerState.SWITCH_ON_DISABLED}
 
 
+@pytest.mark.slow
 def test_bus_off_is_reported_at_once_and_the_axes_stop_by_themselves() -> None:
     outcome = run(
         "bus off", at(FaultKind.BUS_OFF, axis=None), guard_ms=GUARD_MS, afterwards=2 * GUARD_MS
@@ -209,6 +211,7 @@ def test_bus_off_is_reported_at_once_and_the_axes_stop_by_themselves() -> None:
     assert set(outcome.states) == {PowerState.SWITCH_ON_DISABLED}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "field"),
     [(FaultKind.LOST, "missing"), (FaultKind.LATE, "late"), (FaultKind.DUPLICATE, "duplicate")],
@@ -235,6 +238,7 @@ def test_toggle_bits_of_a_sound_cell_are_no_fault_and_a_lost_frame_is_none_of_th
     assert outcome.restored
 
 
+@pytest.mark.slow
 def test_a_short_frame_alone_is_counted_and_the_run_goes_on() -> None:
     outcome = run("one short", at(FaultKind.SHORT_PDO, cycles=1))
     assert outcome.error is None
@@ -242,6 +246,7 @@ def test_a_short_frame_alone_is_counted_and_the_run_goes_on() -> None:
     assert (outcome.statistics.wrong_length, outcome.statistics.missing) == (1, 1)
 
 
+@pytest.mark.slow
 def test_someone_who_only_asks_a_drive_is_reported_and_does_not_stop_the_run() -> None:
     outcome = run("asks", at(FaultKind.SDO_MASTER, cycles=5))
     assert outcome.error is None

@@ -206,6 +206,7 @@ def kill_process(foreign_id: int) -> Killed:
             os.close(end)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("guarded", [True, False], ids=["1016h", "without"])
 def test_amplifiers_stop_by_themselves_when_the_recorder_is_killed(guarded: bool) -> None:
     """Without 1016h the same axes go on to their target and keep their power:
@@ -218,6 +219,7 @@ def test_amplifiers_stop_by_themselves_when_the_recorder_is_killed(guarded: bool
     assert end.arrived != guarded
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("node_id", [3, 7, 64, 127])
 def test_no_foreign_device_takes_the_place_of_a_killed_recorder(node_id: int) -> None:
     """One with an id of an axis is refused. `make guard-study` tries every id."""

@@ -358,6 +358,7 @@ def test_filters_need_not_be_given(example: SimpleNamespace) -> None:
     assert np.all(error < 4.0 * of_slow.estimate.gains_std)
 
 
+@pytest.mark.slow
 def test_a_calibration_brings_its_filters(example: SimpleNamespace) -> None:
     model = example.main().model
     runs = [

@@ -153,6 +153,7 @@ def test_a_moved_base_is_named() -> None:
     assert np.degrees(np.linalg.norm(found.values)) == pytest.approx(4.0, abs=0.5)
 
 
+@pytest.mark.slow
 def test_a_base_that_moved_after_gravity_was_corrected_is_named_with_its_size() -> None:
     """What has changed is counted from the gravity of the calibration,
     not from the declared one.

@@ -61,6 +61,7 @@ def _scores(cell: WeighedCell, found: WeighedBody) -> FloatArray:
     )
 
 
+@pytest.mark.slow
 def test_errors_are_as_large_as_their_sigma(
     small_truth: Truth, cells: tuple[WeighedCell, ...]
 ) -> None:
@@ -117,6 +118,7 @@ def test_an_error_of_the_calibration_is_in_sigma_as_it_is_in_the_body(
     assert share_root == pytest.approx(np.abs(shift), rel=0.03, abs=0.03 * largest_absolute_shift)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("beside", [0, 1])
 def test_the_tolerance_of_the_reference_mass_is_in_sigma_as_a_wrong_mass_is_in_the_body(
     small_truth: Truth,

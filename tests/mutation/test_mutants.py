@@ -71,6 +71,7 @@ def test_what_is_no_behaviour_gets_no_fault(source: str) -> None:
     assert _planted(source) == set()
 
 
+@pytest.mark.slow
 def test_every_fault_changes_the_program_of_a_real_file() -> None:
     source = (ROOT / "ident" / "arrays.py").read_bytes()
     original = ast.dump(ast.parse(source))
@@ -81,6 +82,7 @@ def test_every_fault_changes_the_program_of_a_real_file() -> None:
         assert source[: mutant.start].count(b"\n") + 1 == mutant.line
 
 
+@pytest.mark.slow
 def test_a_draw_is_repeated_by_its_seed_and_takes_every_room() -> None:
     first = chosen_mutants(ROOT, seed=5, count=60)
     again = chosen_mutants(ROOT, seed=5, count=60)

@@ -84,6 +84,7 @@ def calibration(made: Made, rubbing: tuple[Run, Run]) -> Calibration:
     return calibration_of(identified, AXES, FIVE_BAR.gains, steps=steps)
 
 
+@pytest.mark.slow
 def test_friction_of_a_cut_pivot_is_named_with_its_size(calibration: Calibration) -> None:
     (accepted,) = calibration.effects
     assert (accepted.name, accepted.axis) == ("passive-friction", PIVOT)

@@ -800,6 +800,7 @@ def test_a_report_that_nobody_can_read_is_no_report_of_a_write(bench: Bench) -> 
     assert bench.controller.read_bytes() != before
 
 
+@pytest.mark.slow
 def test_a_change_that_cannot_be_shown_is_not_written(bench: Bench) -> None:
     before = bench.controller.read_bytes()
     command = [
@@ -819,6 +820,7 @@ def test_a_change_that_cannot_be_shown_is_not_written(bench: Bench) -> None:
     assert bench.controller.read_bytes() == before
 
 
+@pytest.mark.slow
 def test_an_output_that_fails_says_which_were_written_before(
     bench: Bench, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -899,6 +901,7 @@ def test_an_option_of_the_drives_is_not_ignored_without_them(
     assert bench.controller.read_bytes() == before
 
 
+@pytest.mark.slow
 def test_the_name_of_a_controller_file_neither_commands_the_terminal_nor_makes_a_line(
     bench: Bench, capsys: pytest.CaptureFixture[str]
 ) -> None:

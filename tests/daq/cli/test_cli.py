@@ -394,6 +394,7 @@ def test_info_of_a_damaged_log_is_exit_code_4(
     assert "checksum" in output.err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("more", [[], ["--json"]])
 def test_an_output_that_cannot_be_written_is_reported(
     log: Path, checkout: Path, more: list[str]
@@ -408,6 +409,7 @@ def test_an_output_that_cannot_be_written_is_reported(
     assert not re.search("Traceback|Exception", done.stderr)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("more", [[], ["--json"]])
 def test_a_reader_that_has_seen_enough_is_no_error_to_report(
     log: Path, checkout: Path, more: list[str]

@@ -72,6 +72,7 @@ def shell(tmp_path: Path, checkout: Path) -> Iterator[Shell]:
     made.close()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(shutil.which("bash") is None, reason="no bash")
 def test_bash_completes_verbs_options_and_names_of_files(shell: Shell, tmp_path: Path) -> None:
     (tmp_path / "lathe.yaml").touch()

@@ -92,6 +92,7 @@ def test_an_error_as_text_waits_for_no_types_of_documents(checkout: Path) -> Non
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("verb", UNUSED)
 def test_a_quick_verb_loads_only_libraries_that_it_uses(
     verb: str, checkout: Path, tmp_path: Path

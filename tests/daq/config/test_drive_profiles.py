@@ -513,6 +513,7 @@ def recorded(
     )
 
 
+@pytest.mark.slow
 def test_torque_and_temperature_are_read_beside_the_samples(
     checkout: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

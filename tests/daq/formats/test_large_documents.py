@@ -36,6 +36,7 @@ def test_yaml_that_would_take_minutes_is_refused_at_once(text: str) -> None:
     assert time.process_time() - began < 2.0
 
 
+@pytest.mark.slow
 def test_yaml_within_the_bounds_is_read_and_rewritten() -> None:
     text = GAIN + "more:\n" + "- 1.5\n" * 5000 + "# a comment\n" * 10_000
     document = decode_document(text.encode(), "controller.yaml")

@@ -84,6 +84,7 @@ def fails(rig: Rig, cell: SimulatedCell, kind: type[Exception]) -> Exception:
     return caught.value
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", STOPS)
 def test_a_fault_in_motion_ends_the_job_and_leaves_the_controller_as_it_was(
     tmp_path: Path, short_plan: Path, name: str
@@ -160,6 +161,7 @@ def test_a_drive_that_refuses_its_mapping_ends_the_command_with_its_error(
     assert (outcome, rig.session.state.exit_code) == expected
 
 
+@pytest.mark.slow
 def test_a_run_with_a_single_bad_frame_is_recorded_again(tmp_path: Path, one_move: Path) -> None:
     """Once its recorder accepts the run the job goes on,
     here to a payload that is never mounted.
@@ -175,6 +177,7 @@ def test_a_run_with_a_single_bad_frame_is_recorded_again(tmp_path: Path, one_mov
     assert (rig.session.folder / "bare-1-aside-1.mcap").exists()
 
 
+@pytest.mark.slow
 def test_faults_with_which_a_run_goes_on_do_not_end_the_job(tmp_path: Path, one_move: Path) -> None:
     policy = {"motion": "allowed", "unguarded": "allowed"}
     folder = tmp_path / "cell"
@@ -242,6 +245,7 @@ def test_no_kind_of_fault_is_left_out() -> None:
     assert seen | {*REFUSALS, *COUNTED, *(fault.kind for fault in BORNE)} == set(FaultKind)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", COUNTED, ids=lambda kind: kind.value)
 def test_a_run_that_is_invalid_whenever_it_is_made_ends_the_job(
     tmp_path: Path, one_move: Path, kind: FaultKind

@@ -123,6 +123,7 @@ def test_a_cell_that_was_renamed_or_has_the_history_of_another_robot_is_held(
     assert asked == []
 
 
+@pytest.mark.slow
 def test_an_interlock_that_opens_between_two_runs_ends_the_job_there(
     tmp_path: Path, one_move: Path
 ) -> None:
@@ -457,6 +458,7 @@ def not_counted(rig: Rig) -> list[str]:
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("days", [3, 730])
 def test_a_job_under_a_later_date_does_not_hold_the_next_ones(
     tmp_path: Path, made: Made, days: int
@@ -541,6 +543,7 @@ def test_a_clock_before_this_program_was_made_holds_the_job_and_says_what_to_set
     assert exit_code(JobHeld) == ExitCode.JOB_HELD
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("days", [-730, -3, 3, 730])
 def test_a_clock_that_steps_in_a_session_changes_no_age(
     tmp_path: Path, made: Made, days: int

@@ -110,6 +110,7 @@ def test_the_payload_was_changed_between_the_runs(whole_job: tuple[Rig, Made]) -
     assert made.closed.final.training_error.total < 10.0
 
 
+@pytest.mark.slow
 def test_a_session_that_was_begun_with_now_is_taken_up_by_a_plain_job(
     tmp_path: Path, made: Made
 ) -> None:
@@ -134,6 +135,7 @@ def test_a_session_that_was_begun_with_now_is_taken_up_by_a_plain_job(
     assert (last.session, last.attempt) == expected
 
 
+@pytest.mark.slow
 def test_nothing_is_due_while_the_last_good_calibration_is_young(
     tmp_path: Path, made: Made
 ) -> None:

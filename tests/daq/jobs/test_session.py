@@ -56,6 +56,7 @@ def test_two_cells_of_one_folder_have_sessions_of_their_own(tmp_path: Path) -> N
     assert folders == ["demo.recalibration", "other.recalibration"]
 
 
+@pytest.mark.slow
 def test_a_cell_is_due_whatever_another_one_keeps_in_its_folder(tmp_path: Path, made: Made) -> None:
     cell_folder = tmp_path / "cell"
     rig = made_rig(cell_folder, made, keep_sessions=1, every_h=1)

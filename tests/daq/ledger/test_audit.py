@@ -80,6 +80,7 @@ def _lines(path: Path) -> list[bytes]:
     return path.read_bytes().splitlines()
 
 
+@pytest.mark.slow
 @given(
     st.lists(
         st.tuples(

@@ -197,6 +197,7 @@ def test_a_drift_is_reported_with_its_time_its_size_and_a_question(
     assert [point["applied_by"] for point in axis["points"] if point["applied_by"]] == ["anna"]
 
 
+@pytest.mark.slow
 def test_a_drift_from_the_first_day_is_reported_as_steady(
     cell_file: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -631,6 +632,7 @@ def test_the_picture_is_drawn_the_same_each_time(
     assert out.read_bytes() == first
 
 
+@pytest.mark.slow
 def test_a_picture_has_its_kind_and_replaces_only_its_like(cell_file: Path) -> None:
     _filled(cell_file, 1, lambda _: FLAT)
     history_path = cell_file.parent / "history.pdf"

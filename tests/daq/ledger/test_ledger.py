@@ -199,6 +199,7 @@ def test_acknowledgements_come_back(ledger: Ledger) -> None:
     assert read_history(ledger).acknowledgements == (expected,)
 
 
+@pytest.mark.slow
 @settings(max_examples=200, deadline=None)
 @given(
     st.datetimes(
@@ -273,6 +274,7 @@ def _add_many(folder: Path, weeks: range) -> None:
         enter(ledger_in(folder), calibration_of(week))
 
 
+@pytest.mark.slow
 def test_two_processes_at_once_lose_nothing(tmp_path: Path) -> None:
     writers = [
         FORK.Process(target=_add_many, args=(tmp_path, range(first, 30))) for first in (0, 10, 20)

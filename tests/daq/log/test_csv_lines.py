@@ -474,6 +474,7 @@ PIECES = (
 PARTS = (None, KeptPart(from_row=2), KeptPart(to_row=3), KeptPart(from_s=0.01), KeptPart(to_s=0.02))
 
 
+@pytest.mark.slow
 @settings(max_examples=300, deadline=None)
 @given(
     lines=st.lists(

@@ -658,6 +658,7 @@ def test_a_rate_that_drifts(
     )
 
 
+@pytest.mark.slow
 def test_an_import_that_is_terminated_leaves_nothing(bench: Bench) -> None:
     """SIGTERM ends a process at once, unless the verb asks for an interrupt instead."""
     script = (
@@ -1078,6 +1079,7 @@ def test_counts_need_an_encoder(bench: Bench) -> None:
         import_recording(bench.description, bench.data, bench.out, software="x")
 
 
+@pytest.mark.slow
 def test_the_real_tx40(checkout: Path, shared_data: Path, tmp_path: Path) -> None:
     """Nine seconds of a real arm: every number of the files is in the log to half a count."""
     out = tmp_path / "tx40.mcap"

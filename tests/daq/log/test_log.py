@@ -126,6 +126,7 @@ def test_an_event_that_names_a_file_whose_name_is_no_utf_8_is_logged(tmp_path: P
     assert texts == [r"OutputFailed: \udcff.mcap: no space left"]
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=60)
 @given(_recordings(), EVENTS)
 def test_round_trip(recording: tuple[int, list[Sample]], events: list[CellEvent]) -> None:

@@ -161,6 +161,7 @@ def _records(draw: st.DrawFn) -> bytes:
     )
 
 
+@pytest.mark.slow
 @settings(FUZZ, max_examples=200)
 @given(st.lists(_records(), max_size=5))
 def test_records_made_up_with_right_checksums_are_read_or_named(
@@ -210,6 +211,7 @@ def _messages(draw: st.DrawFn) -> bytes:
     return raw_record(Opcode.MESSAGE, head_body, draw(st.none() | st.none() | BITS16))
 
 
+@pytest.mark.slow
 @settings(FUZZ, max_examples=200)
 @given(st.lists(_messages(), max_size=6), st.booleans(), TEXTS)
 @example([], True, "1")

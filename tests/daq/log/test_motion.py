@@ -100,6 +100,7 @@ def _log(path: Path, rows: list[Sample]) -> Path:
     return write(path, demo_content(CHECKOUT), rows)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", GLITCHES)
 def test_a_glitch_of_the_encoder_is_refused_and_called_invalid_by_all(
     kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]

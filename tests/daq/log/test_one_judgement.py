@@ -329,6 +329,7 @@ LARGE: dict[str, tuple[Callable[[MadeUp], object], str]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", LARGE)
 def test_a_log_has_no_more_and_no_larger_texts_than_a_recorder_writes(
     kind: str, made: MadeUp, tmp_path: Path

@@ -125,6 +125,7 @@ def test_an_unfinished_bag_says_how_to_repair_it(tmp_path: Path) -> None:
         read(bag)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [LARGEST_CHUNK, LARGEST_CHUNK + 1])
 def test_a_chunk_that_unfolds_to_more_than_a_chunk_is_refused(size: int) -> None:
     packed = bz2.compress(bytes(size))
@@ -145,6 +146,7 @@ def bags(tmp_path_factory: pytest.TempPathFactory) -> tuple[bytes, ...]:
     )
 
 
+@pytest.mark.slow
 @settings(max_examples=150, deadline=None)
 @given(
     seed=st.integers(0, 2**32),

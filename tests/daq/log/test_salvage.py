@@ -160,6 +160,7 @@ def test_a_process_that_is_killed_loses_no_more(tmp_path: Path, checkout: Path) 
     assert _same(read_log(saved.log).samples, saved.statistics.samples)
 
 
+@pytest.mark.slow
 def test_every_cut_gives_a_beginning_or_a_named_error(part: Path, tmp_path: Path) -> None:
     data = part.read_bytes()
     counts = []

@@ -1138,6 +1138,7 @@ def test_effects_that_the_cell_declares_are_in_both_models_of_the_comparison(
         fit_module.check_holdout(fitted)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("options", [(), ("--json",)])
 def test_what_was_found_is_printed_although_the_disk_is_full(
     closed: Closed,

@@ -74,6 +74,7 @@ WORDS = st.text(
 SENTENCES = st.lists(WORDS, max_size=30).map(" ".join)
 
 
+@pytest.mark.slow
 @given(
     rows=st.lists(st.lists(SENTENCES, min_size=5, max_size=5), min_size=1, max_size=3),
     wrap=st.sets(st.integers(0, 4)),

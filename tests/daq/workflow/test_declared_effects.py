@@ -86,6 +86,7 @@ def test_what_would_leave_the_effects_out_is_refused() -> None:
         refuse_effects(CELL, "--cases")
 
 
+@pytest.mark.slow
 def test_a_fit_with_given_gains_has_the_effect_too() -> None:
     runs = heavy_runs(balanced=True)
     start = identify(

@@ -399,6 +399,7 @@ def test_a_damaged_file_is_refused_or_gives_the_bodies(cut: int, rubbish: str) -
     assert b'<mass value="2.5"/>' in updated.content
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("content", "says"),
     [

@@ -76,6 +76,7 @@ def pair(shelf: Shelf) -> Fit:
         return fit(_paths("run0", "run1"))
 
 
+@pytest.mark.slow
 def test_logs_become_sources_with_their_roles(
     shelf: Shelf, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -78,6 +78,7 @@ def test_gains_are_true_and_the_calibration_predicts_with_the_friction_of_the_pa
     assert without.error.total > 2.0 * validation.error.total
 
 
+@pytest.mark.slow
 def test_without_the_key_friction_that_falls_becomes_gain(
     shelf: Shelf, monkeypatch: pytest.MonkeyPatch
 ) -> None:

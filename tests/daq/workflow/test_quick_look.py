@@ -165,6 +165,7 @@ def test_after_a_move_each_gain_is_beside_its_target_with_the_worst_first(
     assert why == "its current is noisy"
 
 
+@pytest.mark.slow
 def test_sigma_goes_on_from_that_of_the_estimator(
     nothing: GainsSoFar, blocks: tuple[Run, ...]
 ) -> None:

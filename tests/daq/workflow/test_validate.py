@@ -53,6 +53,7 @@ def test_the_file_gives_the_errors_of_the_fit(
     assert found["filter"]["position_cutoff_hz"] == 100.0
 
 
+@pytest.mark.slow
 def test_text_and_picture(
     real: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

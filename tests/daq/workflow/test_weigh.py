@@ -30,6 +30,7 @@ from tests.daq.calibrations import demo_calibration
 from tests.daq.logs import DISC, demo_content, samples, write
 
 
+@pytest.mark.slow
 def test_a_real_robot_that_touched_nothing(
     real: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -72,6 +73,7 @@ def test_quiet_motion_that_the_fit_has_seen_is_warned_of(caplog: pytest.LogCaptu
     assert caplog.messages == ["seen was part of the fit: no proof"]
 
 
+@pytest.mark.slow
 def test_a_real_flange_without_a_body_weighs_nothing(
     real: tuple[Path, Path], capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
 ) -> None:

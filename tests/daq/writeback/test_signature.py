@@ -276,6 +276,7 @@ def test_a_secret_key_is_its_owners_alone_and_never_replaced(tmp_path: Path) -> 
     assert "seed" not in repr(secret_key)
 
 
+@pytest.mark.slow
 def test_a_key_without_a_password_that_others_may_read_signs_nothing(calibration: Path) -> None:
     secret, _ = generate(calibration.parent, "anna")
     secret.chmod(0o640)
@@ -288,6 +289,7 @@ def test_a_key_without_a_password_that_others_may_read_signs_nothing(calibration
     assert signers_of(calibration, trusted) == ("bert",)
 
 
+@pytest.mark.slow
 def test_a_password_protects_the_key(calibration: Path) -> None:
     secret, public = generate(calibration.parent, "anna", "grüne Bohne")
     assert needs_password(secret)
@@ -339,6 +341,7 @@ def test_whatever_is_not_there_or_in_the_way_is_reported(calibration: Path) -> N
         generate(calibration / "below a file", "bert")
 
 
+@pytest.mark.slow
 def test_the_verbs_make_a_key_sign_and_check(
     calibration: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -145,6 +145,7 @@ frames = st.builds(
 )
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=20)
 @given(st.lists(frames, min_size=1, max_size=20))
 def test_what_is_sent_is_what_the_other_end_receives(burst: list[can.Message]) -> None:

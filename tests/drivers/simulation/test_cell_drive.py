@@ -159,6 +159,7 @@ def test_a_closed_run_leaves_no_axis_with_power(
         assert all(word & 0x6F == 0x40 for word in stopped.statusword)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("cell")
 def test_an_emergency_of_a_node_stops_the_others(
     address: BusAddress, axes: tuple[Axis, ...]

@@ -30,6 +30,7 @@ def problem(seed: int, joints: int, extra: int) -> tuple[np.ndarray, np.ndarray,
     )
 
 
+@pytest.mark.slow
 @given(seed=st.integers(0, 2**32 - 1), joints=st.integers(1, 6), extra=st.integers(0, 2))
 @settings(max_examples=150, deadline=None)
 def test_solution_meets_its_conditions_and_only_dissipates(

@@ -96,6 +96,7 @@ def test_it_distinguishes_rest_from_motion(
         assert data.moving[speed > 0.05 * speed_quantile].all()
 
 
+@pytest.mark.slow
 def test_gains_are_as_good_as_with_declared_speeds(truth: Truth, sticking: tuple[Run, ...]) -> None:
     # With noisy currents the two keep different rows, and their errors differ by chance.
     assert _gain_error(truth, sticking, DERIVED) < 1.3 * _gain_error(truth, sticking, CONDITIONING)

@@ -153,6 +153,7 @@ def test_a_saturation_on_two_moves_alone_is_not_tested_and_says_what_to_record(
     assert finding.too_few_moves == finding.refusals[0]
 
 
+@pytest.mark.slow
 def test_noise_on_few_moves_that_the_others_do_not_show_is_no_effect(
     search_problem: SearchProblem,
 ) -> None:

@@ -72,6 +72,7 @@ def test_contradiction_never_refutes_what_instruments_find_at_half_the_size(
     assert contradiction(sign * share * fitted, std, sign * fitted, placed) == ""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("delay_ms", "stays"), [(0.0, False), (0.1, False), (8.0, True)])
 def test_a_delay_that_explains_little_must_be_far_from_zero(delay_ms: float, stays: bool) -> None:
     runs = []

@@ -106,6 +106,7 @@ def test_a_known_noise_comes_back(resting: tuple[Dataset, ...]) -> None:
         assert floor.std_percent < 20.0
 
 
+@pytest.mark.slow
 def test_the_estimates_scatter_as_they_say_and_are_not_biased(resting: tuple[Dataset, ...]) -> None:
     drawn = [_all(noise_floors(_noisy(resting, seed), CONDITIONING)) for seed in range(20)]
     noise_a = []
@@ -120,6 +121,7 @@ def test_the_estimates_scatter_as_they_say_and_are_not_biased(resting: tuple[Dat
     assert relative.std() == pytest.approx(reported, rel=0.25)
 
 
+@pytest.mark.slow
 def test_the_lower_limit_is_below_the_noise_as_often_as_it_says(
     resting: tuple[Dataset, ...],
 ) -> None:
@@ -233,6 +235,7 @@ def test_standstill_alone_is_no_bound(
     assert all(floor.is_bound for floor in _all(noise_floors(_noisy(repeated), SMALL)))
 
 
+@pytest.mark.slow
 def test_repeated_moves_recover_a_known_noise(repeated: tuple[Dataset, ...]) -> None:
     """Torques of the motion cancel, ten times larger than the noise in a row;
     the start of a move is no sample.

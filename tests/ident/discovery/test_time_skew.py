@@ -37,6 +37,7 @@ def _fitted(truth: Truth, runs: tuple[Run, ...]) -> Evidence:
     return gather(identify(truth.model, runs, THREE, keep_rows=True))
 
 
+@pytest.mark.slow
 def test_least_squares_find_a_skew_in_the_loop_that_instruments_do_not_confirm(
     small_truth: Truth, disturbed: tuple[Run, ...]
 ) -> None:
@@ -48,6 +49,7 @@ def test_least_squares_find_a_skew_in_the_loop_that_instruments_do_not_confirm(
     assert not found.is_in_model
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("planted_s", [0.008, -0.008])
 def test_a_planted_skew_is_confirmed_with_its_value_and_sign(
     small_truth: Truth, disturbed: tuple[Run, ...], planted_s: float

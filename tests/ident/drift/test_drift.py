@@ -443,6 +443,7 @@ def test_a_slope_is_reported_along_its_line() -> None:
     )
 
 
+@pytest.mark.slow
 def test_no_alarm_in_24_recalibrations_without_drift() -> None:
     """1.1 % of the histories of six axes at most; 3000 draws know that to 0.2 %.
 

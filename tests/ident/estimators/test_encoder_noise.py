@@ -33,6 +33,7 @@ def _noise(rng: np.random.Generator, correlation_s: float) -> FloatArray:
     return np.asarray(np.einsum("km,km->k", _directions().basis[:, :, 0], both))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("correlation_s", [1e-6, 0.1, 0.5])
 def test_an_estimate_with_white_rows_has_its_own_deviation(correlation_s: float) -> None:
     slow_columns = np.stack(

@@ -63,6 +63,7 @@ def test_each_step_takes_the_worst_of_a_new_estimate(system: System) -> None:
         del names[worst]
 
 
+@pytest.mark.slow
 def test_gains_hardly_change_and_the_error_hardly_grows(system: System) -> None:
     whole = ml(system)
     found = essential(system, ml, 30.0)

@@ -93,6 +93,7 @@ def test_the_order_of_runs_does_not_matter(
     assert after.gains_std == pytest.approx(before.gains_std, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_permuting_the_motors_permutes_the_gains(truth: Truth, noisy_runs: tuple[Run, ...]) -> None:
     order = np.array([0, 2, 1, 3, 5, 4])
     drive_train = DriveTrain(truth.model.drive_train.ratio[order])

@@ -144,6 +144,7 @@ def test_runs_that_were_folded_in_while_they_grew_are_the_whole_runs(
     assert _std(fit.gains()) == pytest.approx(_std(whole.gains()), rel=0.3)
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=8)
 @given(lengths=st.lists(st.integers(3, LONG_SAMPLES - 1), max_size=6))
 def test_a_move_that_a_look_divides_counts_once(
@@ -205,6 +206,7 @@ def test_the_grown_equations_serve_maximum_likelihood(
     assert grown.gains_std == pytest.approx(whole.gains_std, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_a_redundant_robot_grows_too() -> None:
     made = recorded(PLANAR, noise_a=0.02)
     fit = GrowingFit(made.model, made.conditioning, (BODY,))

@@ -134,6 +134,7 @@ def test_joint_data_std_follows_the_noise_of_the_current_and_not_the_gain(
     assert found[axis] == pytest.approx(quiet[axis], rel=0.05)
 
 
+@pytest.mark.slow
 def test_tls_with_noise_in_the_currents_is_as_good_as_ml(small_truth: Truth) -> None:
     errors: dict[str, list[float]] = {"ml": [], "tls": [], "residuals": []}
     for seed in range(1, 5):

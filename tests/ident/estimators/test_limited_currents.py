@@ -56,6 +56,7 @@ def limits_named(found: Identification) -> list[Diagnosis]:
     return [one for one in diagnose(found, AXES) if one.name == "current-limited"]
 
 
+@pytest.mark.slow
 def test_a_drive_that_gives_less_is_named_and_its_samples_are_left_out(runs: list[Run]) -> None:
     limit_a = largest_a(runs)
     used = [winding_up(run, limit_a) for run in runs]

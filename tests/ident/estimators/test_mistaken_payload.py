@@ -56,6 +56,7 @@ def test_forgotten_in_a_run_declared_loaded(truth: Truth, noisy_runs: tuple[Run,
         identify(truth.model, runs, CONDITIONING)
 
 
+@pytest.mark.slow
 def test_exchanged_roles_turn_every_sign_and_friction_shows_it(
     truth: Truth, noisy_runs: tuple[Run, ...]
 ) -> None:

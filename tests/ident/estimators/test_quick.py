@@ -87,6 +87,7 @@ def small_gains(small_truth: Truth, small_pieces: tuple[Run, ...]) -> QuickGains
     return quick_gains(reduce_runs(small_truth.model, small_pieces, SMALL))
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=10)
 @given(exponents=st.lists(st.integers(-4, 4), min_size=3, max_size=3), heavier=st.floats(0.1, 10.0))
 def test_gains_are_in_the_units_of_currents_and_payload(

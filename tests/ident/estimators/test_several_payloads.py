@@ -75,6 +75,7 @@ def identified(truth: Truth, mixed: tuple[Run, ...]) -> Identification:
     return identify(truth.model, mixed, CONDITIONING)
 
 
+@pytest.mark.slow
 def test_each_mounting_has_its_own_unknowns(identified: Identification) -> None:
     """Disc twice, plate once, runs of each in any order;
     the plate's mass is unknown and is found.
@@ -91,6 +92,7 @@ def test_each_mounting_has_its_own_unknowns(identified: Identification) -> None:
     assert "m:a" not in values
 
 
+@pytest.mark.slow
 def test_one_unknown_vector_for_two_mountings_ruins_the_gains(
     truth: Truth, mixed: tuple[Run, ...]
 ) -> None:

@@ -120,6 +120,7 @@ def test_weighting_rows_by_joint_gains_what_it_says() -> None:
     assert np.all(np.diag(measured) < 0.35 * np.diag(of_ls))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scaling", [Scaling.NONE, Scaling.ROWS])
 def test_total_least_squares_scatters_as_equation_23_says(scaling: Scaling) -> None:
     """Equal, independent errors in every entry of W_tot: what eq.

@@ -55,6 +55,7 @@ DRIVE = [
 ]
 
 
+@pytest.mark.slow
 @given(st.lists(st.floats(-2.0, 5.0), min_size=len(DRIVE), max_size=len(DRIVE)))
 def test_terms_and_what_is_left_over_have_the_torque_of_the_parameters(values: list[float]) -> None:
     standard = _standard(dict(zip(DRIVE, values, strict=True)))

@@ -118,6 +118,7 @@ def _check_possible(found: PhysicalParameters) -> None:
             assert power >= -1e-9
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=4, derandomize=True)
 @given(seed=st.integers(0, 10**6), gravity=st.sampled_from(GRAVITIES))
 @pytest.mark.parametrize("arm", ARMS, ids=[arm.name for arm in ARMS])
@@ -142,6 +143,7 @@ def test_a_possible_robot_keeps_its_torque(
     assert torque_difference_norm <= 1e-6 * expected_norm
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=4, derandomize=True)
 @given(seed=st.integers(0, 10**6))
 @pytest.mark.parametrize("arm", ARMS, ids=[arm.name for arm in ARMS])

@@ -63,6 +63,7 @@ def test_the_predicted_deviation_is_that_of_a_fit(mechanism: Mechanism) -> None:
     assert np.all((ratio > 0.5) & (ratio < 2.0))
 
 
+@pytest.mark.slow
 def test_moves_show_every_gain_of_a_redundant_drive_and_rest_shows_none() -> None:
     made = made_of(PLANAR, 3, seconds=18.0, preload_nm=0.0)
     noise_a = np.full(4, 0.01)

@@ -161,6 +161,7 @@ def test_the_information_is_that_of_the_fits_own_equation() -> None:
     )
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=15)
 @given(seed=st.integers(0, 10_000), factor=st.floats(0.1, 10.0), times=st.integers(1, 5))
 def test_deviations_scale_with_noise_and_repetition(seed: int, factor: float, times: int) -> None:

@@ -40,6 +40,7 @@ def plan(model: ident.Model) -> ident.PlannedMoves:
     return ident.plan_moves(model, LIMITS, EXAMPLE.DISC, EXAMPLE.NAMEPLATE_NM_A, exchanges=400)
 
 
+@pytest.mark.slow
 def test_moves_keep_the_limits_and_begin_and_end_at_rest(plan: ident.PlannedMoves) -> None:
     time_s, motion = plan.motion(RATE_HZ)
     assert plan.duration_s <= 40.0
@@ -171,6 +172,7 @@ def test_a_robot_with_a_joint_that_follows_an_axis_is_planned_for_with_what_it_c
     assert np.all(found_percent < plan.predicted_std_percent)
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_moves(model: ident.Model, plan: ident.PlannedMoves) -> None:
     again = ident.plan_moves(
         model, LIMITS, EXAMPLE.DISC, list(EXAMPLE.NAMEPLATE_NM_A), exchanges=400
