@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import chain
 from random import Random
 
 import numpy as np
@@ -47,13 +48,14 @@ def made() -> tuple[Recorded, list[list[Frame]]]:
         ]
         bus.append([Frame(time_ns, SYNC, b""), *answers])
     own = np.array(times[FIRST:], dtype=np.int64)
+    values = []
+    for cycle in range(CYCLES):
+        of_axes = [value(cycle, axis) for axis in range(AXES)]
+        values.append(of_axes)
     log = Recorded(
         np.arange(CYCLES),
         START_NS + own - own[0],
-        np.array(
-            [[value(cycle, axis) for axis in range(AXES)] for cycle in range(CYCLES)],
-            dtype=np.int64,
-        ),
+        np.array(values, dtype=np.int64),
         np.zeros(CYCLES, dtype=np.int64),
         START_NS,
         valid=True,
@@ -62,12 +64,14 @@ def made() -> tuple[Recorded, list[list[Frame]]]:
 
 
 def violations(log: Recorded, bus: list[list[Frame]]) -> list[str]:
-    return compare(log, [frame for cycle in bus for frame in cycle], NODES).violations
+    frames = list(chain.from_iterable(bus))
+    return compare(log, frames, NODES).violations
 
 
 def test_a_sound_log_agrees_with_the_bus() -> None:
     log, bus = made()
-    found = compare(log, [frame for cycle in bus for frame in cycle], NODES)
+    frames = list(chain.from_iterable(bus))
+    found = compare(log, frames, NODES)
     assert found.violations == []
     assert (found.samples, found.values, found.flagged) == (CYCLES, CYCLES * AXES, 0)
 

@@ -95,7 +95,8 @@ def _judged(problem: SearchProblem, *trials: CandidateTrial) -> list[Finding]:
     families = [FamilyTrials(0, ((Saturation(), one),)) for one in shaped]
     rng = np.random.default_rng(2)
     ranked = rank_families(problem, families, rng, GATES)
-    return [next(f for f in ranked if f.coefficients is one.coefficients) for one in shaped]
+    of_trials = {id(finding.coefficients): finding for finding in ranked}
+    return [of_trials[id(one.coefficients)] for one in shaped]
 
 
 def test_without_the_moves_of_most_leverage_is_a_fit_of_the_others() -> None:

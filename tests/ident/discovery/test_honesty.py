@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import combinations
 
@@ -164,10 +165,9 @@ def test_the_choice_of_a_setting_does_not_see_its_fold(problem: Linearisation) -
     residual = folds.linearisation.residual + 5.0 * own * columns[:, 0]
     changed_linearisation = replace(folds.linearisation, residual=residual)
     changed = cut_into_folds(changed_linearisation)
-    before, after = (
-        score_candidates(one, columns, [slice(i, i + 1) for i in range(3)])
-        for one in (folds, changed)
-    )
+    each_column = [slice(i, i + 1) for i in range(3)]
+    before = score_candidates(folds, columns, each_column)
+    after = score_candidates(changed, columns, each_column)
     for one, other in zip(before, after, strict=True):
         assert one is not None
         assert other is not None
@@ -216,14 +216,17 @@ def test_a_family_known_from_another_axis_competes_with_its_own_name(small: Evid
     """
     problem = search_problem_of(small)
     families = tuple(family[::4] for family in EFFECTS)
-    plain, related = (
-        {
-            (one.effect.name, one.axis): one.probability
-            for one in rank_effects(problem, np.random.default_rng(3), GATES, families, known=known)
-            if one.probability is not None  # of one that rests on too few moves
-        }
-        for known in ((), KNOWN)
-    )
+
+    def probabilities(known: Sequence[str]) -> dict[tuple[str, int], float]:
+        rng = np.random.default_rng(3)
+        found = {}
+        for one in rank_effects(problem, rng, GATES, families, known=known):
+            if one.probability is not None:  # of one that rests on too few moves
+                found[one.effect.name, one.axis] = one.probability
+        return found
+
+    plain = probabilities(())
+    related = probabilities(KNOWN)
     assert plain.keys() == related.keys()
     for key, probability in plain.items():
         if key[0] in KNOWN:

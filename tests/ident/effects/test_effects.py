@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import chain, combinations
+from typing import Any
 
 import numpy as np
 import pytest
@@ -94,19 +95,25 @@ def _over_its_range(variable: Abscissa, signed: int, other_axis: int = 0) -> Smo
     return Smooth(variable, lower, upper, signed, other_axis)
 
 
-GENERIC: tuple[tuple[Effect, ...], ...] = (
-    *(
-        tuple(_over_its_range(variable, signed) for signed in signs)
-        for variable, signs in VARIABLES
-    ),
-    tuple(_over_its_range(Abscissa.OTHER_VELOCITY, signed, other_axis=4) for signed in (0, 1)),
-    (Periodic(0), Periodic(1)),
-)
-MEMBERS = [
-    pytest.param(effect, id=f"{effect.name}-{index}")
-    for family in (*EFFECTS, *GENERIC)
-    for index, effect in enumerate(family)
-]
+def _generic_families() -> Iterator[tuple[Effect, ...]]:
+    for variable, signs in VARIABLES:
+        yield tuple(_over_its_range(variable, signed) for signed in signs)
+    other = Abscissa.OTHER_VELOCITY
+    yield tuple(_over_its_range(other, signed, other_axis=4) for signed in (0, 1))
+    yield (Periodic(0), Periodic(1))
+
+
+GENERIC = tuple(_generic_families())
+ALL_EFFECTS = (*chain.from_iterable(EFFECTS), *chain.from_iterable(GENERIC))
+
+
+def _members() -> Iterator[Any]:
+    for family in (*EFFECTS, *GENERIC):
+        for index, effect in enumerate(family):
+            yield pytest.param(effect, id=f"{effect.name}-{index}")
+
+
+MEMBERS = list(_members())
 
 
 def _same(one: FloatArray, other: FloatArray) -> bool:
@@ -220,9 +227,10 @@ def test_every_property_can_be_refuted_and_is_claimed_by_someone() -> None:
     of_signals = set(Property) - {Property.TURNS_THE_ARM}
     claims = {claim for _, claim in WRONG}
     assert claims == of_signals
-    declares = {effect.declares for family in (*EFFECTS, *GENERIC) for effect in family}
+    declares = {effect.declares for effect in ALL_EFFECTS}
     assert declares == of_signals
-    assert {effect.declares for family in GEOMETRY for effect in family} == {Property.TURNS_THE_ARM}
+    of_geometry = {effect.declares for effect in chain.from_iterable(GEOMETRY)}
+    assert of_geometry == {Property.TURNS_THE_ARM}
 
 
 @pytest.mark.parametrize("effect", MEMBERS)
@@ -318,9 +326,11 @@ def test_a_pair_is_named_by_its_lower_axis_and_only_angles_have_a_sine() -> None
 
 
 def test_families_hold_one_name_and_names_are_unique() -> None:
-    names = [{effect.name for effect in family} for family in EFFECTS]
-    assert all(len(name) == 1 for name in names)
-    assert len(set.union(*names)) == len(names)
+    names = set()
+    for family in EFFECTS:
+        (name,) = {effect.name for effect in family}
+        names.add(name)
+    assert len(names) == len(EFFECTS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -346,19 +356,14 @@ def _duplicates(families: tuple[tuple[Effect, ...], ...]) -> list[tuple[str, str
     session_s = 300.0 + rest.time_s
     runs = (first_run, replace(rest, session_s=session_s))
     spans: list[tuple[str, FloatArray, bool]] = []
-    for effect in (effect for family in families for effect in family):
-        torque = np.concatenate(
-            [at_joints(effect, 0, effect.columns(run, 0), train) for run in runs], axis=-1
-        )
+    for effect in chain.from_iterable(families):
+        torque_of_runs = [at_joints(effect, 0, effect.columns(run, 0), train) for run in runs]
+        torque = np.concatenate(torque_of_runs, axis=-1)
+        # joint, parameter, sample → parameter, joint and sample
         columns = np.moveaxis(torque, 1, 0).reshape(torque.shape[1], -1)
+        directions = np.linalg.svd(columns, full_matrices=False)[2]
         settings = ", ".join(f"{value:g}" for value in effect.settings.values())
-        spans.append(
-            (
-                f"{effect.name} ({settings})",
-                np.linalg.svd(columns, full_matrices=False)[2],
-                effect.with_motor,
-            )
-        )
+        spans.append((f"{effect.name} ({settings})", directions, effect.with_motor))
     pairs = []
     for (one, first, driven), (other, second, other_driven) in combinations(spans, 2):
         if driven != other_driven:  # never on the same joint

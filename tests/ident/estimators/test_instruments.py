@@ -47,10 +47,8 @@ def test_iv_solves_the_equations_of_its_instruments(disturbed: tuple[Identificat
     sums = []
     sizes = []
     for motor, gain in enumerate(estimate.gains):
-        recorded, instrument = (
-            np.concatenate([cluster[motor] for cluster in one.clusters])
-            for one in (system, projected)
-        )
+        recorded = np.concatenate([cluster[motor] for cluster in system.clusters])
+        instrument = np.concatenate([cluster[motor] for cluster in projected.clusters])
         error = recorded[:, 0] - (recorded[:, 1:-1] @ estimate.parameters + recorded[:, -1]) / gain
         predicted = (instrument[:, 1:-1] @ estimate.parameters + instrument[:, -1]) / gain
         predicted_norm = np.linalg.norm(predicted)

@@ -62,7 +62,10 @@ def test_a_drive_that_gives_less_is_named_and_its_samples_are_left_out(runs: lis
     used = [winding_up(run, limit_a) for run in runs]
     found = fitted(used)
     named = limits_named(found)
-    assert {axis for one in named for axis in one.axes} == {AXES[AXIS]}
+    axes: set[str] = set()
+    for diagnosis in named:
+        axes.update(diagnosis.axes)
+    assert axes == {AXES[AXIS]}
     torque_limits = found.channels[-1].torque_limits
     assert torque_limits[AXIS] == pytest.approx(limit_a, rel=0.12)
     with_all = fitted(used, keep_rows=False)

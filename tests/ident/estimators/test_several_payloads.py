@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -62,11 +63,16 @@ def mixed(truth: Truth) -> tuple[Run, ...]:
         (Payload("disc", "b", {"m": 4.59}), OTHER_MOUNTING),
         (Payload("plate", "c"), PLATE),
     ]
-    return tuple(
-        _record(truth, f"{payload.mounting if payload else 'bare'}{index}", rng, payload, body)
-        for index in range(2)
-        for payload, body in bodies
-    )
+    runs = []
+    for index in range(2):
+        for payload, body in bodies:
+            if payload is None:
+                load = "bare"
+            else:
+                load = payload.mounting
+            run = _record(truth, f"{load}{index}", rng, payload, body)
+            runs.append(run)
+    return tuple(runs)
 
 
 @pytest.fixture(scope="module")
@@ -99,10 +105,15 @@ def test_one_unknown_vector_for_two_mountings_ruins_the_gains(
     """Why a mounting has a name: the disc turned, and declared as if it had not been."""
     runs = [run for run in mixed if run.payload is None or run.payload.name == "disc"]
     confused = [replace(run, payload=MOUNTED) if run.payload else run for run in runs]
-    right, wrong = (
-        np.max(np.abs(ml(regrouped(r)).gains / GAINS - 1.0))
-        for r in (reduce_runs(truth.model, given, CONDITIONING) for given in (runs, confused))
-    )
+
+    def worst_error(given: Sequence[Run]) -> float:
+        reduced = reduce_runs(truth.model, given, CONDITIONING)
+        estimate = ml(regrouped(reduced))
+        relative_error = np.abs(estimate.gains / GAINS - 1.0)
+        return float(relative_error.max())
+
+    right = worst_error(runs)
+    wrong = worst_error(confused)
     assert right < 0.01
     assert wrong > 5.0 * right
 
