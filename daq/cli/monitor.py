@@ -12,7 +12,7 @@ import typer
 
 from daq.cli.record import mounted
 from daq.cli.scan import no_answer
-from daq.cli.terminal import interruptible, until_interrupted
+from daq.cli.terminal import ENDING, interruptible, until_interrupted
 from daq.cli.verb import CellArgument, JsonOption, print_json, read_calibration, read_cell
 from daq.environment import require_packages
 from daq.errors import UsageError
@@ -65,7 +65,7 @@ def monitor_verb(
     policy = SdoPolicy(timeout_s=0.3, attempts=2)
     with (
         until_interrupted(),
-        interruptible(),
+        interruptible(signals=ENDING),
         Feed(cell, stop=None) as feed,
         CanopenNetwork(cell_address(declared), drive_axes(declared), policy=policy) as network,
     ):

@@ -62,7 +62,7 @@ class RecordOptions:
 
 @taking(RecordOptions)
 def record_verb(options: RecordOptions) -> None:
-    """Execute the moves of a plan and log every sample; Ctrl-C and SIGTERM stop the axes.
+    """Execute the moves of a plan and log every sample; Ctrl-C, Ctrl-Z and SIGTERM stop the axes.
 
     Where the cell file has an interlock (`recalibration`), it must release the robot: exit code
     11 where it does not.

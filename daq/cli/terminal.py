@@ -516,7 +516,9 @@ def delay_signals() -> Iterator[None]:
         raise KeyboardInterrupt
 
 
-SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  #: Signals that ask a program to end
+SIGNALS = (*ENDING, signal.SIGQUIT, signal.SIGTSTP)
+"""Those, Ctrl-\\ and Ctrl-Z: a recorder that is suspended would leave its axes to themselves."""
 GRACE_S = 10.0  #: Longer than a stop of all axes takes
 ONE_KEY_S = 0.3  #: Signals that are closer together count as one
 
@@ -528,8 +530,9 @@ def interruptible(
     """Turn signals within the block into KeyboardInterrupt,
     and ignore those that follow within `GRACE_S`.
 
-    By default SIGTERM and SIGHUP end a process at once, and the axes would keep moving; a shell
-    starts background jobs (&) with SIGINT ignored, and only a handler of our own makes them
+    By default SIGTERM, SIGHUP and SIGQUIT end a process at once, SIGTSTP suspends it, and the axes
+    would keep moving; a shell starts background jobs (&) with SIGINT ignored, and only a handler of
+    our own makes them
     interruptible. The first signal starts the stop of the axes, which a second one must not cut
     short; later signals count again, so that a hanging stop can be left. The yielded context
     manager protects a stop that a fault has started in the same way; a signal that arrives

@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from daq.cli.app import main
+from daq.cli.terminal import SIGNALS
 from daq.errors import ExitCode
 from tests.pipeline.simulated_bus import served_cell
 
@@ -99,7 +100,7 @@ def test_plan_record_info_and_the_same_plan_again(
     assert "file of that name" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
+@pytest.mark.parametrize("number", SIGNALS)
 def test_an_interrupted_recording_stops_the_axes_and_says_so(
     cell: Path,
     long_plan: Path,
