@@ -532,12 +532,11 @@ def interruptible(
 
     By default SIGTERM, SIGHUP and SIGQUIT end a process at once, SIGTSTP suspends it, and the axes
     would keep moving; a shell starts background jobs (&) with SIGINT ignored, and only a handler of
-    our own makes them
-    interruptible. The first signal starts the stop of the axes, which a second one must not cut
-    short; later signals count again, so that a hanging stop can be left. The yielded context
-    manager protects a stop that a fault has started in the same way; a signal that arrives
-    meanwhile is dropped, because it asks for what is happening already. The context yields a
-    function that returns whether a second signal came, after which the settings of the axes need
+    our own makes them interruptible. The first signal starts the stop of the axes, which a second
+    one must not cut short; later signals count again, so that a hanging stop can be left. The
+    yielded context manager protects a stop that a fault has started in the same way; a signal that
+    arrives meanwhile is dropped, because it asks for what is happening already. The context yields
+    a function that returns whether a second signal came, after which the settings of the axes need
     not be restored any more. Outside the main thread, where Python handles no signals, nothing
     changes.
     """
