@@ -33,24 +33,19 @@ class QueuedFile(io.RawIOBase):
 
     def __init__(
         self,
-        path: Path,
+        descriptor: int,
         write: Callable[[int, memoryview], int] = os.write,
         clock_s: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Create the file, and start its thread.
+        """Start the thread.
 
         Args:
-            path: of the file.
+            descriptor: of the file, which is closed with this one.
             write: writes a part of some bytes and returns their number, as `os.write`.
             clock_s: monotonic time [s].
-
-        Raises:
-            FileExistsError: there is a file of that name.
-            OSError: the file system refuses.
         """
         super().__init__()
-        flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
-        self._descriptor = os.open(path, flags, 0o666)
+        self._descriptor = descriptor
         self.longest_wait_s = 0.0
         """Longest time between a `write` and the disk's having taken it [s]."""
         self._write = write
@@ -64,6 +59,22 @@ class QueuedFile(io.RawIOBase):
         self._changed = threading.Condition()
         self._thread = threading.Thread(target=self._run, name="log", daemon=True)
         self._thread.start()
+
+    @classmethod
+    def create(
+        cls,
+        path: Path,
+        write: Callable[[int, memoryview], int] = os.write,
+        clock_s: Callable[[], float] = time.monotonic,
+    ) -> QueuedFile:
+        """Create a file of that name; the other arguments are those of the class.
+
+        Raises:
+            FileExistsError: there is a file of that name.
+            OSError: the file system refuses.
+        """
+        flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
+        return cls(os.open(path, flags, 0o666), write, clock_s)
 
     def writable(self) -> bool:
         """Return that it can be written."""

@@ -172,7 +172,7 @@ class LogWriter:
     def _new_part(self) -> BufferedWriter:
         if self._waits_for_disk:
             return self.part.open("xb")
-        self._queued = QueuedFile(self.part)
+        self._queued = QueuedFile.create(self.part)
         return BufferedWriter(self._queued)
 
     @property

@@ -162,6 +162,7 @@ def measured_map(tree: Path, folder: Path, jobs: int) -> CoverageMap:
         measured = coverage.CoverageData(basename=str(_data_file(folder, room)))
         measured.read()
         data.update(measured)
+        measured.close()
         durations.update(json.loads(_durations_file(folder, room).read_text()))
     return CoverageMap(data, durations, tree)
 

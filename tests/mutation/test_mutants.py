@@ -5,6 +5,8 @@ what they are, where they stand, and which tests it runs.
 from __future__ import annotations
 
 import ast
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -130,14 +132,22 @@ def test_a_planted_fault_can_be_taken_out_again() -> None:
     assert mutant.planted(source) == b"x = a <= b\n"
 
 
-def _map_of(tmp_path: Path, source: str, executed: dict[str, list[int]]) -> CoverageMap:
-    """Coverage of one file by tests; the empty name is what runs at import."""
-    (tmp_path / "a.py").write_text(source)
+@pytest.fixture
+def nothing_recorded(tmp_path: Path) -> Iterator[CoverageMap]:
+    """Coverage of no file, in memory."""
     data = CoverageData(no_disk=True)
+    yield CoverageMap(data, {}, tmp_path)
+    data.close(force=True)
+
+
+def _recorded(empty: CoverageMap, source: str, executed: dict[str, list[int]]) -> CoverageMap:
+    """Coverage of one file by tests; the empty name is what runs at import."""
+    file = empty.tree / "a.py"
+    file.write_text(source)
     for test, lines in executed.items():
-        data.set_context(test)
-        data.add_lines({str(tmp_path / "a.py"): lines})
-    return CoverageMap(data, {"tests/x/test_a.py::one": 3.0}, tmp_path)
+        empty.data.set_context(test)
+        empty.data.add_lines({str(file): lines})
+    return replace(empty, durations_s={"tests/x/test_a.py::one": 3.0})
 
 
 SOURCE = """LIMIT = 3
@@ -157,9 +167,9 @@ def test_lines_that_read_a_name_are_those_of_its_assignment() -> None:
     assert lines_that_read(SOURCE, 6) == ()
 
 
-def test_a_constant_is_tried_with_the_tests_that_read_it(tmp_path: Path) -> None:
+def test_a_constant_is_tried_with_the_tests_that_read_it(nothing_recorded: CoverageMap) -> None:
     executed = {"": [1, 2, 3, 5, 7], "tests/x/test_a.py::one": [6], "tests/y/test_b.py::two": [8]}
-    covered = _map_of(tmp_path, SOURCE, executed)
+    covered = _recorded(nothing_recorded, SOURCE, executed)
     assert covered.tests_that_could_notice("a.py", 1) == ("tests/x/test_a.py::one",)
     assert covered.tests_that_could_notice("a.py", 3) == ("tests/y/test_b.py::two",)
     assert covered.tests_that_could_notice("a.py", 6) == ("tests/x/test_a.py::one",)
@@ -167,21 +177,26 @@ def test_a_constant_is_tried_with_the_tests_that_read_it(tmp_path: Path) -> None
     assert len(covered.tests_that_could_notice("a.py", 5)) == 2
 
 
-def test_a_line_that_nothing_executes_is_tried_with_the_tests_of_its_file(tmp_path: Path) -> None:
-    covered = _map_of(tmp_path, SOURCE, {"": [1, 2, 3, 5, 7], "tests/x/test_a.py::one": [6]})
+def test_a_line_that_nothing_executes_is_tried_with_the_tests_of_its_file(
+    nothing_recorded: CoverageMap,
+) -> None:
+    executed = {"": [1, 2, 3, 5, 7], "tests/x/test_a.py::one": [6]}
+    covered = _recorded(nothing_recorded, SOURCE, executed)
     assert not covered.executes("a.py", 8)
     assert covered.executes("a.py", 1)
     assert covered.tests_that_could_notice("a.py", 8) == ("tests/x/test_a.py::one",)
 
 
-def test_the_file_named_after_a_module_comes_first_and_then_the_cheapest(tmp_path: Path) -> None:
+def test_the_file_named_after_a_module_comes_first_and_then_the_cheapest(
+    nothing_recorded: CoverageMap,
+) -> None:
     durations = {
         "tests/x/test_dear.py::one": 3.0,
         "tests/x/test_dear.py::two": 3.0,
         "tests/x/test_cheap.py::one": 4.0,
         "tests/x/test_own.py::one": 9.0,
     }
-    covered = CoverageMap(CoverageData(no_disk=True), durations, tmp_path)
+    covered = replace(nothing_recorded, durations_s=durations)
     order = ["tests/x/test_own.py", "tests/x/test_cheap.py", "tests/x/test_dear.py"]
     assert list(covered.cheapest_files(durations, "own")) == order
     assert covered.affordable(list(durations), 10.0) == [

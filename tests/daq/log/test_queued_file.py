@@ -44,7 +44,11 @@ def test_pieces_are_written_in_order_where_the_disk_takes_a_part_at_a_time(
     tmp_path_factory: pytest.TempPathFactory, pieces: list[bytes], portion: int
 ) -> None:
     path = tmp_path_factory.mktemp("queued") / "log"
-    with QueuedFile(path, lambda descriptor, data: os.write(descriptor, data[:portion])) as file:
+
+    def write_portion(descriptor: int, data: memoryview) -> int:
+        return os.write(descriptor, data[:portion])
+
+    with QueuedFile.create(path, write_portion) as file:
         for piece in pieces:
             assert file.write(piece) == len(piece)
         size_bytes = file.tell()
@@ -56,7 +60,7 @@ def test_pieces_are_written_in_order_where_the_disk_takes_a_part_at_a_time(
 def test_a_write_returns_while_the_disk_takes_nothing(tmp_path: Path) -> None:
     disk = SlowDisk()
     path = tmp_path / "log"
-    with QueuedFile(path, disk.write) as file:
+    with QueuedFile.create(path, disk.write) as file:
         file.write(b"one ")
         assert disk.is_asked.wait(WAIT_S)
         file.write(b"two")
@@ -69,7 +73,7 @@ def test_a_write_returns_while_the_disk_takes_nothing(tmp_path: Path) -> None:
 def test_the_longest_wait_is_that_of_the_disk(tmp_path: Path) -> None:
     now_s = 10.0
     disk = SlowDisk()
-    with QueuedFile(tmp_path / "log", disk.write, lambda: now_s) as file:
+    with QueuedFile.create(tmp_path / "log", disk.write, lambda: now_s) as file:
         file.write(b"one")
         assert disk.is_asked.wait(WAIT_S)
         now_s = 10.7
@@ -85,7 +89,7 @@ def test_the_longest_wait_is_that_of_the_disk(tmp_path: Path) -> None:
 def test_a_disk_that_takes_nothing_for_long_is_an_error(tmp_path: Path, after_s: float) -> None:
     now_s = 0.0
     disk = SlowDisk()
-    with QueuedFile(tmp_path / "log", disk.write, lambda: now_s) as file:
+    with QueuedFile.create(tmp_path / "log", disk.write, lambda: now_s) as file:
         file.write(b"one")
         assert disk.is_asked.wait(WAIT_S)
         now_s = after_s
@@ -99,7 +103,7 @@ def test_a_disk_that_takes_nothing_for_long_is_an_error(tmp_path: Path, after_s:
 
 def test_what_the_disk_refuses_is_raised_by_the_next_write(tmp_path: Path) -> None:
     path = tmp_path / "log"
-    file = QueuedFile(path, refuse)
+    file = QueuedFile.create(path, refuse)
     file.write(b"one")
     with pytest.raises(OSError, match="No space left"):
         file.drain()
@@ -115,7 +119,7 @@ def test_a_file_of_that_name_is_not_touched(tmp_path: Path) -> None:
     path = tmp_path / "log"
     path.write_bytes(b"before")
     with pytest.raises(FileExistsError):
-        QueuedFile(path)
+        QueuedFile.create(path)
     assert path.read_bytes() == b"before"
 
 

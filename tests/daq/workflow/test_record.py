@@ -473,8 +473,8 @@ def test_a_disk_that_takes_nothing_for_200_cycles_costs_none_of_them(
         now_s = 1.2
         return os.write(descriptor, data)
 
-    slow_file = partial(QueuedFile, write=write_late, clock_s=lambda: now_s)
-    monkeypatch.setattr("daq.log.writer.QueuedFile", slow_file)
+    slow_file = partial(QueuedFile.create, write=write_late, clock_s=lambda: now_s)
+    monkeypatch.setattr("daq.log.writer.QueuedFile.create", slow_file)
     done = lockstep.run()
     assert stalled_cycles[0] >= 200
     assert (done.log.valid, done.log.lost_cycles) == (True, 0)
@@ -493,7 +493,8 @@ def test_a_disk_that_refuses_ends_the_recording_with_its_reason(
             raise OSError(28, os.strerror(28))
         return os.write(descriptor, data)
 
-    monkeypatch.setattr("daq.log.writer.QueuedFile", partial(QueuedFile, write=refuse_later))
+    refusing_file = partial(QueuedFile.create, write=refuse_later)
+    monkeypatch.setattr("daq.log.writer.QueuedFile.create", refusing_file)
     with pytest.raises(OutputFailed, match="no space left"):
         lockstep.run()
     assert lockstep.out.with_name("a.mcap.part").exists()
