@@ -21,6 +21,8 @@ from drivers.simulation.faults import FaultKind, FaultSpec
 from drivers.simulation.spec import ToggleBit
 from tests.faults.cells import STRIKE, Outcome, run
 
+pytestmark = pytest.mark.slow  # each fault takes a recording of its own
+
 AXIS = 2
 GUARD_MS = 2000
 

@@ -26,6 +26,8 @@ from tests.daq.jobs.rig import Rig, make_rig, powerless, serving
 from tests.faults.test_at_start import REFUSALS
 from tests.faults.test_in_motion import STOPS
 
+pytestmark = pytest.mark.slow  # each fault takes a job of its own
+
 STRIKE = 120
 """SYNCs since power-on: in the first move of the first recording,
 which begins at about 30 and takes more than 500.

@@ -18,6 +18,8 @@ from drivers.stream.sync import LockstepSync
 from tests.drivers.foreign import MAKES, MOVE, ForeignNode, foreign_cell, shipped
 from tests.drivers.scripted import PERIOD_NS, ScriptedBus, permission
 
+pytestmark = pytest.mark.slow  # each drive takes a network of its own
+
 
 def written(bus: ScriptedBus) -> list[str]:
     """Objects that were written, and NMT commands."""
