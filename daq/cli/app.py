@@ -338,7 +338,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if arguments is None:
         # A process of one command: almost all that it makes at its start stays, and searching it
         # for garbage again and again is a sixth of the time of `info`. A recording sets limits of
-        # its own (daq/workflow/safeguards.py).
+        # its own (daq/workflow/on_time.py).
         gc.set_threshold(20_000, 50, 100)
     WRITTEN.clear()
     CHANGED.clear()

@@ -1,5 +1,6 @@
-"""Write a log that survives a crash: at most the last 200 ms are only in memory, and what a slow
-disk has not taken yet.
+"""Write a log that survives a crash.
+
+At most the last 200 ms are only in memory, and what a slow disk has not taken yet.
 """
 
 from __future__ import annotations
@@ -172,7 +173,7 @@ class LogWriter:
     def _new_part(self) -> BufferedWriter:
         if self._waits_for_disk:
             return self.part.open("xb")
-        self._queued = QueuedFile.create(self.part)
+        self._queued = QueuedFile(self.part.open("xb", buffering=0))
         return BufferedWriter(self._queued)
 
     @property
@@ -393,7 +394,7 @@ class LogWriter:
         if self._keeps_part:
             remedy = (
                 "what was recorded until then stays in that file, which no fit reads (`drivegain "
-                "salvage` saves it); free space and record again"
+                "salvage` saves it); free space or take another disk, and record again"
             )
         return OutputFailed(
             str(self.part),

@@ -37,16 +37,14 @@ from daq.log.writer import LogContent, LogWriter
 from daq.workflow.experiment import limits_of, path_of
 from daq.workflow.interlock import release_check
 from daq.workflow.nameplates import check_nameplates, nameplate_warnings
+from daq.workflow.on_time import on_time
 from daq.workflow.plan import Plan, check_way, way_to_first_target
 from daq.workflow.safeguards import (
     DiskRoom,
     FreeBytes,
     check_entered_mass,
-    defer_full_gc,
     free_bytes,
     largest_log_bytes,
-    real_time_priority,
-    switch_threads_soon,
 )
 from drivers.canopen.bus import BusAddress
 from drivers.canopen.network import CanopenNetwork, SignalBlocker
@@ -207,9 +205,7 @@ def record(
     require_released = require_released or release_check(cell, clocks.now)
     require_released()
     with (
-        defer_full_gc(),
-        switch_threads_soon(),
-        real_time_priority(),
+        on_time(),
         network_of(cell, block_signals) as network,
         _sync_producer(cell, network) as wanted,
     ):

@@ -1,15 +1,9 @@
-"""Safeguards of a recording: disk space, the payload's mass, deferred garbage collection,
-priority.
-"""
+"""Safeguards of a recording: disk space, and the payload's mass."""
 
 from __future__ import annotations
 
-import gc
-import os
 import shutil
-import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
 from daq.config.cell import Cell, WeighedPayload
@@ -142,64 +136,3 @@ def check_entered_mass(cell: Cell, payload: Payload | None, entered_kg: float | 
             remedy="weigh it again and correct the wrong one of the two: all gains are in "
             "proportion to this mass",
         )
-
-
-#: Time after which a thread that waits for the interpreter gets it [s]; 5 ms by default
-SWITCH_S = 0.0005
-NEVER = 2**31 - 1  #: Searches of the middle generation before one of everything
-
-
-@contextmanager
-def defer_full_gc() -> Iterator[None]:
-    """Defer full collections until the block ends; young objects are still collected.
-
-    A search through all that the program and its libraries have made takes tens of milliseconds, in
-    which nothing else of the process runs: so many periods without SYNC at 1 kHz, and a run that is
-    marked invalid.
-    """
-    before = gc.get_threshold()
-    # Python's own limits for young objects, which the command line raises: each of these searches
-    # takes microseconds.
-    gc.set_threshold(700, 10, NEVER)
-    try:
-        yield
-    finally:
-        gc.set_threshold(*before)
-
-
-@contextmanager
-def switch_threads_soon() -> Iterator[None]:
-    """Let no thread keep the one that paces SYNC waiting for longer than half a millisecond.
-
-    While another thread runs Python code, as a progress bar does that is drawn five times a second,
-    this one waits for Python's switch interval: SYNC was up to 5.4 ms late on a terminal, and is up
-    to 1.5 ms late with this interval.
-    """
-    before_s = sys.getswitchinterval()
-    sys.setswitchinterval(SWITCH_S)
-    try:
-        yield
-    finally:
-        sys.setswitchinterval(before_s)
-
-
-@contextmanager
-def real_time_priority() -> Iterator[None]:
-    """Run the calling thread before programs without real-time priority, where that is permitted.
-
-    Next to other work on two processors, SYNC was up to 8.9 ms late without, and 2.9 ms with it. It
-    is the lowest real-time priority, that of the process which stamps frames; threads and processes
-    started in the block do not inherit it, and one that was given to the program stays.
-    """
-    policy = os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK
-    if policy != os.SCHED_OTHER:
-        yield
-        return
-    with suppress(PermissionError):
-        os.sched_setscheduler(0, os.SCHED_RR | os.SCHED_RESET_ON_FORK, os.sched_param(1))
-    try:
-        yield
-    finally:
-        # The flag stays, because not everyone may clear it: without priority it changes nothing.
-        with suppress(PermissionError):
-            os.sched_setscheduler(0, os.SCHED_OTHER | os.SCHED_RESET_ON_FORK, os.sched_param(0))

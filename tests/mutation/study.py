@@ -57,8 +57,8 @@ class Outcome:
     """One row of the study.
 
     `result` is "mirrored" or "other" for the tests that noticed, "survived", or "not executed"
-    where no test of `make test` runs the line in its own process and the tests of the room do not
-    notice it either.
+    where no test runs the line in its own process and the tests of the room do not notice it
+    either.
     """
 
     number: int

@@ -7,7 +7,7 @@ import weakref
 
 import pytest
 
-from daq.workflow.safeguards import defer_full_gc
+from daq.workflow.on_time import defer_full_gc
 
 
 class Ring:

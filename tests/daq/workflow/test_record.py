@@ -5,13 +5,12 @@ what the bus did must be in the log and in its verdict.
 from __future__ import annotations
 
 import gc
+import io
 import json
 import os
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterable
-from functools import partial
 from math import radians
 from pathlib import Path
 
@@ -27,13 +26,14 @@ from daq.log.conversion import load_run
 from daq.log.queued_file import QueuedFile
 from daq.log.reader import read_log
 from daq.log.salvage import salvage
+from daq.workflow.on_time import NEVER, SWITCH_S, real_time_priority
 from daq.workflow.plan import load_plan
 from daq.workflow.record import LATE_LOSSES_S, Clocks, Recorded, RecordingRequest, record
-from daq.workflow.safeguards import NEVER, SWITCH_S, real_time_priority
 from drivers.canopen.network import CanopenNetwork, SignalBlocker
 from drivers.canopen.socketcan import Losses
 from drivers.errors import MotionRefused, NodeMisplaced, SampleLost
 from drivers.messages import EventKind
+from tests.daq.log.disks import Disk, refuse
 from tests.drivers.scripted import PERIOD_NS, ScriptedBus, cell
 
 SECOND_NS = 10**9
@@ -425,12 +425,18 @@ def _policy() -> int:
     return os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK
 
 
-def test_a_recording_has_real_time_priority_where_that_is_permitted(lockstep: Rig) -> None:
+@pytest.fixture
+def priority_is_permitted() -> None:
+    """Skip where this user may have no real-time priority."""
     try:
         os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
     except PermissionError:
-        pytest.skip("this user may have no real-time priority")
+        pytest.skip("this user may have no real-time priority (CAP_SYS_NICE, or a limit rtprio)")
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+
+
+@pytest.mark.usefixtures("priority_is_permitted")
+def test_a_recording_has_real_time_priority_and_gives_it_to_no_thread(lockstep: Rig) -> None:
     found: set[int] = set()
     inherited: set[int] = set()
 
@@ -448,13 +454,13 @@ def test_a_recording_has_real_time_priority_where_that_is_permitted(lockstep: Ri
     assert _policy() == os.SCHED_OTHER
 
 
-def test_a_recording_has_real_time_priority_after_another_one() -> None:
-    """A session records block after block in one process."""
+@pytest.mark.usefixtures("priority_is_permitted")
+def test_the_second_block_of_a_session_has_real_time_priority_too() -> None:
     policies = []
     for _ in range(2):
         with real_time_priority():
             policies.append(_policy())
-    assert policies[0] == policies[1]
+    assert policies == [os.SCHED_RR, os.SCHED_RR]
 
 
 def test_a_disk_that_takes_nothing_for_200_cycles_costs_none_of_them(
@@ -462,21 +468,24 @@ def test_a_disk_that_takes_nothing_for_200_cycles_costs_none_of_them(
 ) -> None:
     """A recorder that waited for this disk would wait for itself."""
     now_s = 0.0
-    stalled_cycles = []
+    is_over = threading.Event()
 
-    def write_late(descriptor: int, data: memoryview) -> int:
+    def count(cycle: int) -> None:
+        if cycle == 200:
+            is_over.set()
+
+    def stall() -> None:
         nonlocal now_s
-        given_up_s = time.monotonic() + 60.0
-        while lockstep.bus.cycle < 200 and time.monotonic() < given_up_s:
-            time.sleep(0.001)
-        stalled_cycles.append(lockstep.bus.cycle)
+        assert is_over.wait(60.0)
         now_s = 1.2
-        return os.write(descriptor, data)
 
-    slow_file = partial(QueuedFile.create, write=write_late, clock_s=lambda: now_s)
-    monkeypatch.setattr("daq.log.writer.QueuedFile.create", slow_file)
+    def slow_file(file: io.FileIO) -> QueuedFile:
+        return QueuedFile(Disk(file, stall), lambda: now_s)
+
+    lockstep.bus.on_cycle = count
+    monkeypatch.setattr("daq.log.writer.QueuedFile", slow_file)
     done = lockstep.run()
-    assert stalled_cycles[0] >= 200
+    assert is_over.is_set()
     assert (done.log.valid, done.log.lost_cycles) == (True, 0)
     samples = read_log(done.path).samples
     assert samples.cycle.tolist() == list(range(len(samples.cycle)))
@@ -488,13 +497,14 @@ def test_a_disk_that_takes_nothing_for_200_cycles_costs_none_of_them(
 def test_a_disk_that_refuses_ends_the_recording_with_its_reason(
     lockstep: Rig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def refuse_later(descriptor: int, data: memoryview) -> int:
+    def refuse_later() -> None:
         if lockstep.bus.cycle > 100:
-            raise OSError(28, os.strerror(28))
-        return os.write(descriptor, data)
+            refuse()
 
-    refusing_file = partial(QueuedFile.create, write=refuse_later)
-    monkeypatch.setattr("daq.log.writer.QueuedFile.create", refusing_file)
+    def full_file(file: io.FileIO) -> QueuedFile:
+        return QueuedFile(Disk(file, refuse_later))
+
+    monkeypatch.setattr("daq.log.writer.QueuedFile", full_file)
     with pytest.raises(OutputFailed, match="no space left"):
         lockstep.run()
     assert lockstep.out.with_name("a.mcap.part").exists()
