@@ -83,7 +83,7 @@ class Parameter:
 
 @dataclass(frozen=True, slots=True)
 class AcceptedEffect:
-    """An effect that the declared model lacked and that held-out data asked for."""
+    """An effect beside the declared model: found by a search, or declared by the cell."""
 
     name: str  #: family, as in ident/effects/
     axis: str  #: name of the axis, of a joint without a motor, or of all axes together
@@ -95,7 +95,7 @@ class AcceptedEffect:
     #: left-out moves.
     error_before_percent: float
     error_after_percent: float  #: the same with the effect
-    #: families whose held-out score does not differ from this one's
+    #: alternatives that passed the search before this one joined, and do not pass beside it
     ambiguity: tuple[str, ...] = ()
     #: Largest torque of the effect on the rows of the fit, at each axis [Nm; N]: no more was ever
     #: seen of it, and a prediction takes no more than EXTRAPOLATED times as much. None of an effect

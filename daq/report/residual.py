@@ -418,11 +418,11 @@ def _unconfirmed(account: Account) -> str:
     empty for a fall, or a rise by more.
     """
     change = account.holdout_change
-    if change is None or change.rise <= 0.0 or change.is_rise:
+    if change is None or change.total.rise <= 0.0 or change.is_harm:
         return ""
     size = ""
-    if change.std:
-        size = f" ({change.rise / change.std:.1f} σ)"
+    if change.total.std:
+        size = f" ({change.total.sigmas:.1f} σ)"
     return f", within its noise{size}: the effects are kept, but not confirmed"
 
 
@@ -639,7 +639,7 @@ def floor_sentences(account: Account, axes: Sequence[str]) -> Iterator[str]:
 
 
 def _holdout_verdict(fitted: Fit, account: Account) -> Iterator[str]:
-    if account.holdout_change is None or not account.holdout_change.is_rise:
+    if account.holdout_change is None or not account.holdout_change.is_harm:
         return
     if fitted.accept_worse_holdout:
         yield (

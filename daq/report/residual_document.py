@@ -258,7 +258,7 @@ def residual_report(fitted: Fit, account: Account, calibration: Calibration) -> 
         confirmed_skew = account.skew
     worse_holdout = None
     if account.holdout_change is not None:
-        worse_holdout = account.holdout_change.is_rise
+        worse_holdout = account.holdout_change.is_harm
     gear_loss = []
     for axis, gear in zip(axes, gear_losses(last), strict=True):
         gear_loss.append(GearLossEntry.of(gear, axis=axis))
@@ -398,7 +398,7 @@ def _verdict(verdict: EffectVerdict, axes: tuple[str, ...]) -> VerdictEntry:
         verdict.placed,
         axes,
         verdict,
-        blocks=verdict.change.total.moves,
+        blocks=verdict.change.total.blocks,
         error_before_percent=verdict.before,
         error_after_percent=verdict.after,
     )

@@ -210,7 +210,7 @@ def _effect(
         )
         sentences.append(f"These data cannot distinguish it from: {rivals}.")
     else:
-        sentences.append("Every other candidate is clearly worse.")
+        sentences.append("These data distinguish it from every other candidate that passed.")
     if not is_in_model:
         sentences.append("A later round removed it again, because it no longer reduced the error.")
     before_by_data = errors_by_data(turn.before)
@@ -295,17 +295,12 @@ def _turn(fitted: Fit, number: int, step: Step) -> str:
         ranked = sorted(shown, key=lambda finding: -finding.held_out_fall)
         caption = (
             "Candidates by how much they reduce the error of left-out moves. Full: passed every "
-            "check. Pale: these data cannot distinguish it from the added one. Hollow: failed a "
-            "check. The scale counts the squared noise of one sample as 1."
+            "check of the search; the fit of everything together comes after it. Pale: these data "
+            "cannot distinguish it from the added one. Hollow: failed a check. The scale counts "
+            "the squared noise of one sample as 1."
         )
         ranking = figure(plot_ranking(ranked, rivals, axes), caption)
     sentences = list(turn_sentences(fitted, step))
-    for rejected in step.set_aside:
-        finding = rejected.finding
-        name = effect_text(finding.effect, axes)
-        sentences.append(f"Not added to {axes[finding.axis]}: {name}: {rejected.reason(axes)}.")
-    if added is not None:
-        sentences.append(f"Added to {axes[added.axis]}: {effect_text(added.effect, axes)}.")
     rows = candidate_rows(fitted, step, _SHOWN)
     return folded(
         f"Search, turn {number}: what was tried",

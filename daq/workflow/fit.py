@@ -61,8 +61,8 @@ from ident.calibration import Calibration, Source
 from ident.calibration import calibration_of as identified_calibration
 from ident.data.run import Run
 from ident.data.torque_channel import TorqueChannel, TorqueSlope, torque_slope
-from ident.discovery.acceptance import accept_on_holdout, compare_on_holdout
-from ident.discovery.before_after import error_on
+from ident.discovery.acceptance import accept_on_holdout
+from ident.discovery.before_after import compare_on_holdout, error_on
 from ident.discovery.current_filter import CurrentFilter, find_current_filter
 from ident.discovery.declared import impossible_declared, with_declared
 from ident.discovery.evidence import Evidence, gather, with_effects, without_effects
@@ -829,7 +829,7 @@ def check_holdout(fitted: Fit) -> None:
     effect_names = {placed.effect.name for placed in after.effects}
     added = after.effects[after.declared :]
     names = [placed.name_among(fitted.cell.place_names) for placed in added]
-    moves = change.total.moves
+    blocks = change.total.blocks
     found = f"an error of held-out runs of {last:.2f} %, {first:.2f} % without"
     if cold and TemperatureFriction.name in effect_names:
         runs = ", ".join(cold)
@@ -837,7 +837,7 @@ def check_holdout(fitted: Fit) -> None:
     raise EffectsRefuted(
         ", ".join(names),
         found=found,
-        expected=f"no rise by more than its noise over their {moves} independent blocks of moves; "
+        expected=f"no rise by more than its noise over their {blocks} independent blocks of moves; "
         f"{harm}",
         remedy="no calibration was written: take `drivegain fit`, which adds no effects, or record "
         "more runs for the fit (or pass --accept-worse-holdout to `drivegain residual`)",

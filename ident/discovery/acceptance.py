@@ -28,10 +28,9 @@ from dataclasses import replace
 import numpy as np
 
 from ident.arrays import takes
-from ident.discovery.before_after import error_on, squares_left
+from ident.discovery.before_after import compare_on_holdout, error_on
 from ident.discovery.candidates import ColumnCache
 from ident.discovery.effect_verdict import EffectVerdict, Judgement, judge_change
-from ident.discovery.error_change import ErrorChange, change_of_errors
 from ident.discovery.evidence import Evidence, place_names, with_effects
 from ident.discovery.gates import Gates
 from ident.discovery.joining import UNFITTED, linearised
@@ -177,31 +176,6 @@ def _judged(
     for placed in left:
         verdicts[placed] = replace(verdicts[placed], judgement=Judgement.REFUTED, reason=reason)
     return start
-
-
-def compare_on_holdout(start: Evidence, before: Evidence, after: Evidence) -> ErrorChange:
-    """Compare two models on held-out rows, in units of the noise of a model without effects.
-
-    Raises:
-        ValueError: nothing was held out.
-    """
-    if before.holdout is None or after.holdout is None:
-        raise ValueError("two models can be compared on held-out rows only if runs were held out")
-    rows = before.holdout
-    noise_a = start.estimate.axis_noise
-    first = squares_left(before.holdout, before.estimate)
-    second = squares_left(after.holdout, after.estimate)
-    used = rows.motor_use
-    motor, source = np.nonzero(used)
-    variance = np.square(noise_a)[motor]
-    return change_of_errors(
-        before=first[used] / variance,
-        after=second[used] / variance,
-        motor=motor,
-        move=rows.move[source],
-        run=rows.run[source],
-        motors=len(noise_a),
-    )
 
 
 def _verdict(start: Evidence, current: Evidence, placed: PlacedEffect) -> EffectVerdict:

@@ -48,7 +48,7 @@ import numpy as np
 import scipy  # loads scipy.special when it is first used: a fit needs none of it
 
 from ident.arrays import FloatArray, IntArray
-from ident.discovery.error_change import PairedChange, compare_by_move
+from ident.discovery.error_change import ErrorChange, change_of_errors
 from ident.discovery.evidence import Evidence, Uncorrected, with_effects
 from ident.discovery.loop import Step
 from ident.discovery.noise_floor import MotorNoiseFloor, noise_floors
@@ -114,20 +114,40 @@ def squares_left(observation: Observation, estimate: Estimate) -> FloatArray:
     return np.square(_currents(observation, estimate).left)
 
 
-def holdout_change(before: Evidence, after: Evidence) -> PairedChange | None:
-    """Compare the squared errors of two models on held-out rows by move [Nm²].
+def holdout_change(start: Evidence, after: Evidence) -> ErrorChange | None:
+    """Compare a model with all its effects with one without, on held-out rows; None without any."""
+    if start.holdout is None or after.holdout is None:
+        return None
+    return compare_on_holdout(start, start, after)
 
-    Currents are weighted by the gains before. None without held-out runs.
+
+def compare_on_holdout(start: Evidence, before: Evidence, after: Evidence) -> ErrorChange:
+    """Compare two models on held-out rows, in units of the noise of a model without effects.
+
+    Args:
+        start: model without effects.
+        before, after: the two models. Their held-out rows are the same.
+
+    Raises:
+        ValueError: nothing was held out.
     """
     if before.holdout is None or after.holdout is None:
-        return None
+        raise ValueError("two models can be compared on held-out rows only if runs were held out")
     rows = before.holdout
+    noise_a = start.estimate.axis_noise
     first = squares_left(before.holdout, before.estimate)
     second = squares_left(after.holdout, after.estimate)
-    squared_gains = np.square(before.estimate.gains)
-    weights = squared_gains[:, None] * rows.motor_use
-    rise = np.sum(weights * (second - first), axis=0)
-    return compare_by_move(rise, rows.move)
+    used = rows.motor_use
+    motor, source = np.nonzero(used)
+    variance = np.square(noise_a)[motor]
+    return change_of_errors(
+        before=first[used] / variance,
+        after=second[used] / variance,
+        motor=motor,
+        move=rows.move[source],
+        run=rows.run[source],
+        motors=len(noise_a),
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -347,14 +367,15 @@ class Account:
     #: error of either model; NaN where it is not known or refuted.
     floor: RelativeError
     holdout_floor: RelativeError | None  #: the same on held-out rows, None without any
-    #: The same of the lower limit of the noise where it is a bound (`NoiseFloor.least_a`): no
+    #: The same of the lower limit of the noise where it is a bound (`MotorNoiseFloor.least_a`): no
     #: model's error is smaller.
     least_floor: RelativeError
     least_holdout_floor: RelativeError | None  #: the same on held-out rows, None without any
     #: change by each turn of the loop, None where it added nothing
     turns: tuple[BeforeAfter | None, ...]
     total: BeforeAfter  #: change from the declared model to the last one
-    holdout_change: PairedChange | None  #: of the squared error on held-out rows, None without any
+    #: of the errors on held-out rows by all effects of the last model, None without any
+    holdout_change: ErrorChange | None
     #: Delay of the currents after the positions, beside the effects of the last model; None where
     #: no instruments exist.
     skew: CurrentDelay | None = None

@@ -295,7 +295,7 @@ def _measured(evidence: Evidence, chosen: _Trial) -> CurrentFilter | None:
     change = _change(evidence, bare, filtered)
     beside_delays = _change(evidence, _with_delays(evidence, bare), filtered)
     found = CurrentFilter(cutoff_hz, std * cutoff_hz, chosen.order, change)
-    falls = [motor.rise < 0.0 for motor in change.motors if motor.moves]
+    falls = [motor.rise < 0.0 for motor in change.motors if motor.blocks]
     is_shared = 2 * sum(falls) > len(falls)
     is_large = found.fallen_share >= LEAST_FALL
     is_better = change.is_fall() and beside_delays.is_fall() and not change.harm("left-out moves")

@@ -51,7 +51,7 @@ def judge_change(change: ErrorChange, motor: int | None = None) -> tuple[Judgeme
     """
     if harm := change.harm("held-out runs"):
         return Judgement.REFUTED, harm
-    blocks = change.total.moves
+    blocks = change.total.blocks
     if blocks < FEWEST_BLOCKS:
         few = (
             f"held-out runs have {blocks} independent blocks of moves, and fewer than "

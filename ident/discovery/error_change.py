@@ -49,18 +49,13 @@ DOUBTFUL = 0.1  #: Share of ‖e‖ of a motor that is no small rise, although i
 
 @dataclass(frozen=True, slots=True)
 class PairedChange:
-    """Change of a squared error on the same rows, and its noise by moves, or by blocks of them."""
+    """Change of a squared error on the same rows, and its noise by blocks of moves."""
 
     rise: float  #: Σ ‖e‖² after − before; negative where the error falls
     std: float  #: its σ
-    moves: int  #: number of moves with rows, or of independent blocks of them
+    blocks: int  #: number of independent blocks of moves
     #: the change in each of them, the smallest first; empty where it is not known
     by_block: tuple[float, ...] = ()
-
-    @property
-    def is_rise(self) -> bool:
-        """Whether the error rises by more than its noise."""
-        return self.rises(CONFIDENCE)
 
     @property
     def sigmas(self) -> float:
@@ -71,18 +66,18 @@ class PairedChange:
 
     def rises(self, confidence: float) -> bool:
         """Whether the error rises by more than its noise, at a one-sided confidence."""
-        if self.moves < 2 or self.rise <= 0.0:
+        if self.blocks < 2 or self.rise <= 0.0:
             return False
-        limit = _student_limit(self.moves - 1, confidence)
-        return self.rise > limit * self.std or self._rises_in_most_blocks(confidence)
+        limit = _student_limit(self.blocks - 1, confidence)
+        return self.rise > limit * self.std or self._rises_by_trimmed_mean(confidence)
 
     def falls(self, confidence: float) -> bool:
         """Whether the error falls by more than its noise, at a one-sided confidence."""
         opposite_blocks = tuple(-change for change in reversed(self.by_block))
-        opposite = PairedChange(-self.rise, self.std, self.moves, opposite_blocks)
+        opposite = PairedChange(-self.rise, self.std, self.blocks, opposite_blocks)
         return opposite.rises(confidence)
 
-    def _rises_in_most_blocks(self, confidence: float) -> bool:
+    def _rises_by_trimmed_mean(self, confidence: float) -> bool:
         """Whether the trimmed mean of the blocks is larger than zero by more than its noise."""
         count = len(self.by_block)
         if count < FEWEST_BLOCKS:
@@ -122,7 +117,7 @@ class ErrorChange:
         """Motors whose error rises by more than noise, and by more than the tolerance."""
         found: list[int] = []
         for motor, change in enumerate(self.motors):
-            if change.moves < FEWEST_BLOCKS:
+            if change.blocks < FEWEST_BLOCKS:
                 continue
             is_large = _is_beyond(change, self.before[motor], SAME_ERROR)
             if is_large and change.rises(self.each_confidence):
@@ -142,13 +137,18 @@ class ErrorChange:
     @property
     def is_enough(self) -> bool:
         """Whether there are blocks enough to tell a change from noise."""
-        return self.total.moves >= FEWEST_BLOCKS
+        return self.total.blocks >= FEWEST_BLOCKS
 
     @property
     def is_rise(self) -> bool:
         """Whether the whole error rises by more than noise, and by more than the tolerance."""
         is_large = _is_beyond(self.total, float(self.before.sum()), SAME_ERROR)
         return self.is_enough and is_large and self.total.rises(CONFIDENCE)
+
+    @property
+    def is_harm(self) -> bool:
+        """Whether an error rises by more than noise, in total or of a motor."""
+        return self.is_rise or bool(self.worse_motors)
 
     def is_fall(self, motor: int | None = None, each: float = CONFIDENCE) -> bool:
         """Whether the error falls by more than noise, in total or of one motor.
@@ -165,7 +165,7 @@ class ErrorChange:
         if self.total.falls(each):
             return True
         own = self.motors[motor]
-        return own.moves >= FEWEST_BLOCKS and own.falls(each)
+        return own.blocks >= FEWEST_BLOCKS and own.falls(each)
 
     def harm(self, data: str) -> str:
         """Say where the error on some data rises by more than noise; empty where nowhere."""
@@ -191,13 +191,6 @@ def _is_beyond(change: PairedChange, before: float, share: float) -> bool:
 
 def _size(change: PairedChange) -> str:
     return f"{change.rise:.3g} ± {change.std:.2g} noise variances"
-
-
-def compare_by_move(change: FloatArray, move: IntArray) -> PairedChange:
-    """Sum the change of each row's squared error, with σ by clusters of moves, shape (r,) each."""
-    _, move_of_row = np.unique(move, return_inverse=True)
-    sums = np.bincount(move_of_row, change)
-    return _of_blocks(np.asarray(sums, dtype=np.float64))
 
 
 def compare_by_block(change: FloatArray, move: IntArray, run: IntArray) -> PairedChange:
@@ -228,7 +221,7 @@ def compare_by_block(change: FloatArray, move: IntArray, run: IntArray) -> Paire
             break
         sums = np.add.reduceat(sums, starts)
         runs = runs[starts]
-    return _of_blocks(sums)
+    return change_of_blocks(sums)
 
 
 def change_of_errors(
@@ -265,14 +258,18 @@ def change_of_errors(
     )
 
 
-def _of_blocks(sums: FloatArray) -> PairedChange:
-    """Change of the whole, with σ by the scatter of the blocks' sums, shape (blocks,)."""
+def change_of_blocks(sums: FloatArray) -> PairedChange:
+    """Return the change of the whole, with σ by the scatter of the blocks.
+
+    Args:
+        sums: change of the squared error in each block, shape (blocks,).
+    """
     count = len(sums)
     deviation = sums - sums.mean()
     variance = np.sum(deviation**2) * count / max(count - 1, 1)
     return PairedChange(
         rise=float(sums.sum()),
         std=float(np.sqrt(variance)),
-        moves=count,
+        blocks=count,
         by_block=tuple(np.sort(sums).tolist()),
     )

@@ -6,8 +6,9 @@ and sees what a search does not look for: two zeros that hide each other, and a 
 a small part of its motor's residual. All join at once, because each of two may explain nothing
 alone. What does not pass the gates of a joint fit leaves again.
 
-Wrong zeros and gravity join before the search. A delay joins behind it: what makes a torque that is
-fast, a coupling or a spring in a gear, looks like a delay until it is in the model.
+Wrong zeros and gravity join before the search. A delay joins after it: what makes a torque that is
+fast, a coupling or a spring in a gear, looks like a delay until it is in the model. The search has
+late positions among its candidates, too, and may have found one by then.
 """
 
 from __future__ import annotations

@@ -131,9 +131,10 @@ def find_effects(
 ) -> tuple[Step, ...]:
     """Find effects that the model lacks, add them one by one, and refit everything after each.
 
-    Mistakes of the description that a check names join first, and delays that it names behind the
-    search (`check_geometry`, `join_mistakes`); what of them does not join is set aside in the last
-    turn. Each turn of the loop:
+    Mistakes of the description that a check names join first (`check_geometry`, `join_mistakes`).
+    Where the check names a delay, it is made again after the search, and what it names then joins
+    if it passes. What is named then and does not join is set aside in the last turn. Each turn of
+    the loop:
 
     1. proposes settings (`propose_orders`, `propose_resonances`) and tests every family on every
        axis: its columns, made from the motion and the predicted load and current, are projected off
@@ -166,8 +167,9 @@ def find_effects(
     passed before, and does not pass beside it.
 
     It ends when nothing passes, at one effect for PIECES_PER_EFFECT pieces, or after MAX_EFFECTS
-    turns. The covariance of the last estimate includes the choice of its effects
-    (`choice_covariance`); an effect that this σ no longer shows leaves (`end_search`). Held-out
+    turns. The covariance of the last estimate includes the choice of its effects in the σ of gains
+    and parameters (`choice_covariance`). An effect that its own σ does not show leaves
+    (`end_search`). Held-out
     runs take no part in it: `ident.discovery.acceptance` judges by them.
 
     Args:
@@ -191,6 +193,7 @@ def find_effects(
 
     Raises:
         EffectRefused: an effect of another package cannot be used.
+        TooFewMoves: there are too few moves to leave some out.
     """
     gates = gates or Gates()
     if progress is None:
@@ -330,13 +333,15 @@ def end_search(
 ) -> Step:
     """Return the last step with the σ that is reported, and the effects that pass in this model.
 
-    σ from the choice of the effects comes last, so that an effect can have passed every gate by a
-    smaller one: it leaves where its coefficients may all be zero by the covariance that is
-    reported, or one of them is impossible. An effect that has passed beside another one must pass
-    without it, too: after each that leaves, the rest is fitted again, and passes the gates of a
-    joint fit again; instruments alone are not asked again, because they take as long as a fit. The
-    worst leaves first. An effect that leaves here is not refuted by it, so that σ contains what it
-    would move.
+    An effect leaves where its coefficients may all be zero by the covariance that is reported, none
+    is larger than its own σ, or one of them is impossible. An effect that has passed beside another
+    one must pass without it, too: after each that leaves, the rest is fitted again, and passes the
+    gates of a joint fit again (`beside_others`). Instruments, rows clear of stops and terms without
+    a name are not asked again: instruments take as long as a fit. The worst leaves first. An effect
+    that leaves here is not refuted by it, so that σ contains what it would move.
+
+    The choice of the effects adds to the σ of gains and parameters, not to that of an effect's own
+    coefficients: another model has no such coefficient.
 
     Of what stays, a coefficient that is a little outside its possible values is held at the nearest
     one.

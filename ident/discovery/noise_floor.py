@@ -41,20 +41,21 @@ paths differ a little.
 What it is. Repeated moves show a part of the noise in motion: ripple that repeats, commutation
 error, and noise slower than a part are not in it. Where all noise is in the current, they show all
 of it, and half of the estimates are too high, by their own σ. So no estimate is a bound, but its
-lower 95 % limit is one, `NoiseFloor.least_a`: of 96 limits on axes of clean simulated cells, 2 are
-above the error of a fit of the right model. It is not tight: where a torque disturbs the arm, it is
-0.8 to 0.9 of that error, and less where standstill shows less.
+lower 95 % limit is one, `MotorNoiseFloor.least_a`: of 96 limits on axes of clean simulated cells, 2
+are above the error of a fit of the right model. It is not tight: where a torque disturbs the arm,
+it is 0.8 to 0.9 of that error, and less where standstill shows less.
 
 Standstill alone bounds nothing. The load of an axis that stands still changes while others move,
 and its integrator follows: in recordings of 40 s, 12 of 47 limits from standstill are above the
 error of the right model, by up to 58 %. Elsewhere it is a fraction of that error, 0.1 to 0.7 with a
 disturbance (`tests/studies/floor_study.py`). Such an estimate is shown as one, and is no noise
-floor (`NoiseFloor.is_bound`).
+floor (`MotorNoiseFloor.is_bound`).
 
 A source may still be no part of the noise in motion, as a brake that takes over the load at rest.
-An estimate far above the error of a model on rows in motion is refuted (`NoiseFloor.is_refuted`); a
-limit that chance has put above that error is shown as the error. Parts with one constant number
-(power stage off, brake on, one run given twice) are no measurement and are left out.
+An estimate far above the error of a model on rows in motion is refuted
+(`MotorNoiseFloor.is_refuted`); a limit that chance has put above that error is shown as the error.
+Parts with one constant number (power stage off, brake on, one run given twice) are no measurement
+and are left out.
 """
 
 from __future__ import annotations

@@ -130,7 +130,7 @@ class OffsetDrift(Effect):
 @dataclass(frozen=True, slots=True)
 class Lag(Effect):
     """τ = −c · ẏ,  T ẏ + y = g v;  c > 0: the current is late by c; c < 0:
-    it is early, by EARLIEST_S at most.
+    it is early, by 10 ms at most.
 
     v is the current that the model predicts, other effects left out. A first-order lag of time
     constant c is this with T = c; a delay is v(t − c) ≈ v − c v̇ + c²/2 · v̈, this with T = c/2 to

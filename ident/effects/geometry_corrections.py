@@ -73,8 +73,7 @@ class ZeroOffset(GeometryEffect):
 
     Source: calibration of joint offsets; Hollerbach, Khalil & Gautier, "Model identification",
     Springer Handbook of Robotics (2016), by torques in the place of poses. Signature: gravity and
-    inertia of the arm behind the joint act in directions that are turned, on the joint and on all
-    those before it.
+    inertia of the arm behind the joint act in directions that are turned, on all joints.
     """
 
     name = "zero-offset"
@@ -197,8 +196,7 @@ class LatePosition(GeometryEffect):
     the position of j is late by c.
 
     Source: Taylor expansion of the torque of the whole arm with one joint later than the others.
-    Signature: in motion alone, on the joint itself and on all joints that its acceleration acts on;
-    a late current shows on its own alone.
+    Signature: in motion alone, on all joints; a late current shows on its own alone.
     """
 
     name = "late-position"

@@ -51,7 +51,7 @@ def test_no_impossible_effect_joins_and_no_effect_raises_the_held_out_error(
     after = find_effects(start, np.random.default_rng(0))[-1].after
     change = holdout_change(start, after)
     assert change is not None
-    assert not change.is_rise
+    assert not change.is_harm
     estimate = after.estimate
     assert not impossible(estimate.unknowns, estimate.parameters, estimate.parameters_std)
     assert not any(placed.effect.name == "warm-up" for placed in after.effects)

@@ -644,7 +644,7 @@ def _with_three_effects(closed: Closed) -> Closed:
         -2e-3, 6e-5, fit_seconds=-3e-3, fit_std=4e-4, confirmed=True, is_in_model=False
     )
     total = replace(closed.account.total, gains=gains)
-    holdout_change = PairedChange(1.3, 1.0, 20)
+    holdout_change = _holdout_change(1.3)
     account = replace(
         closed.account,
         turns=turns,
@@ -655,6 +655,12 @@ def _with_three_effects(closed: Closed) -> Closed:
     odd = Diagnosis("payload-differs", ("loaded-2",), (), "a body", "another", "was it turned?")
     fitted = replace(closed.fitted, steps=steps, diagnoses=(odd,))
     return Closed(fitted, account)
+
+
+def _holdout_change(rise: float) -> ErrorChange:
+    """Change of the whole error on 20 held-out blocks, with a σ of one, and of no motor."""
+    unchanged = PairedChange(0.0, 0.0, 0)
+    return ErrorChange(PairedChange(rise, 1.0, 20), (unchanged,) * 3, np.ones(3))
 
 
 def _calibrated(made: Closed, effects: int) -> Calibration:
@@ -1084,13 +1090,9 @@ def test_effects_that_held_out_runs_refute_are_not_written(
     del shelved
     out = tmp_path / "calibration.yaml"
     folder = tmp_path / "report"
-    rise = PairedChange(5.0, 1.0, 20)
-    monkeypatch.setattr(before_after_module, "holdout_change", lambda *_: rise)
-    paired_change = PairedChange(0.0, 0.0, 0)
-    motors = (paired_change,) * 3
-    monkeypatch.setattr(
-        fit_module, "compare_on_holdout", lambda *_: ErrorChange(rise, motors, np.ones(3))
-    )
+    change = _holdout_change(5.0)
+    monkeypatch.setattr(before_after_module, "compare_on_holdout", lambda *_: change)
+    monkeypatch.setattr(fit_module, "compare_on_holdout", lambda *_: change)
     for name in ("fit", "close_loop"):
         monkeypatch.setattr(fit_module, name, lambda *_, **__: closed.fitted)
     command = [
@@ -1122,12 +1124,7 @@ def test_effects_that_held_out_runs_refute_are_not_written(
 def test_effects_that_the_cell_declares_are_in_both_models_of_the_comparison(
     closed: Closed, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    rise = PairedChange(5.0, 1.0, 20)
-    paired_change = PairedChange(0.0, 0.0, 0)
-    motors = (paired_change,) * 3
-    monkeypatch.setattr(
-        fit_module, "compare_on_holdout", lambda *_: ErrorChange(rise, motors, np.ones(3))
-    )
+    monkeypatch.setattr(fit_module, "compare_on_holdout", lambda *_: _holdout_change(5.0))
     last = closed.fitted.steps[-1]
     assert last.after.effects
     steps = (replace(last, declared=True),)
@@ -1170,8 +1167,7 @@ def test_what_was_found_is_printed_although_the_disk_is_full(
 
 def test_a_rise_within_noise_is_said_with_what_apply_will_refuse(closed: Closed) -> None:
     worse = AcceptedEffect("spring", "J3", {}, (), 2.98, 3.11)
-    change = PairedChange(1.3, 1.0, 20)
-    changed_account = replace(closed.account, holdout_change=change)
+    changed_account = replace(closed.account, holdout_change=_holdout_change(1.3))
     sentences = summary(closed.fitted, changed_account, (worse,))
     (whole,) = (one for one in sentences if one.startswith("All axes together"))
     assert whole.endswith(", within its noise (1.3 σ): the effects are kept, but not confirmed.")
@@ -1181,8 +1177,8 @@ def test_a_rise_within_noise_is_said_with_what_apply_will_refuse(closed: Closed)
         "it, 2.98 %"
     ) in refused
     better = replace(worse, error_after_percent=2.97)
-    holdout_change = replace(change, rise=-1.0)
-    said = summary(closed.fitted, replace(closed.account, holdout_change=holdout_change), (better,))
+    lower = replace(closed.account, holdout_change=_holdout_change(-1.0))
+    said = summary(closed.fitted, lower, (better,))
     assert not any("within its noise" in one or "`apply` refuses" in one for one in said)
 
 

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from ident.data.dataset import Dataset
 from ident.discovery import acceptance
-from ident.discovery.acceptance import accept_on_holdout, compare_on_holdout
+from ident.discovery.acceptance import accept_on_holdout
+from ident.discovery.before_after import compare_on_holdout
 from ident.discovery.effect_verdict import EffectVerdict, Judgement
 from ident.discovery.evidence import Evidence, with_effects
 from ident.discovery.gates import Gates, own_unknowns

@@ -146,22 +146,21 @@ def test_the_effect_helps_its_axis_alone_wherever_it_is_measured(compared: Accou
     assert compared.total.removed == ()
 
 
-def test_held_out_errors_are_compared_by_move(start: Evidence, after: Evidence) -> None:
+def test_held_out_errors_are_compared_in_units_of_noise(start: Evidence, after: Evidence) -> None:
     change = holdout_change(start, after)
     assert change is not None
     assert start.holdout is not None
     assert after.holdout is not None
-    before_nm2, after_nm2 = (
-        error_on(rows, estimate).left @ start.estimate.gains**2
-        for rows, estimate in ((start.holdout, start.estimate), (after.holdout, after.estimate))
-    )
-    assert change.rise == pytest.approx(after_nm2 - before_nm2)
-    unique_moves = np.unique(start.holdout.move)
-    assert change.moves == len(unique_moves)
-    assert not change.is_rise
+    variance = np.square(start.estimate.axis_noise)
+    before = error_on(start.holdout, start.estimate).left / variance
+    afterwards = error_on(after.holdout, after.estimate).left / variance
+    assert change.before == pytest.approx(before)
+    assert change.total.rise == pytest.approx(np.sum(afterwards - before))
+    assert change.total.blocks <= len(np.unique(start.holdout.move))
+    assert not change.is_harm
     without_the_spring = holdout_change(after, start)
     assert without_the_spring is not None
-    assert without_the_spring.is_rise
+    assert without_the_spring.is_harm
     assert holdout_change(replace(start, holdout=None), after) is None
 
 

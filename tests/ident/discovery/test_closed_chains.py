@@ -219,9 +219,9 @@ def test_internal_preload_is_no_error() -> None:
     changed_evidence = replace(evidence, holdout=rows, estimate=worse)
     change = holdout_change(replace(evidence, holdout=rows), changed_evidence)
     assert change is not None
-    assert change.is_rise
+    assert change.is_harm
     rise = error_on(rows, worse).left - error_on(rows, estimate).left
-    assert change.rise == pytest.approx(rise @ estimate.gains**2)
+    assert change.total.rise == pytest.approx(np.sum(rise / np.square(estimate.axis_noise)))
 
 
 def test_an_effect_is_taken_out_of_the_rows_of_all_motors() -> None:

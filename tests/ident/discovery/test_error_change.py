@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from random import Random
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -10,12 +12,13 @@ from numpy.typing import NDArray
 
 from ident.discovery.effect_verdict import Judgement, judge_change
 from ident.discovery.error_change import (
+    CONFIDENCE,
     FEWEST_BLOCKS,
     ErrorChange,
     PairedChange,
+    change_of_blocks,
     change_of_errors,
     compare_by_block,
-    compare_by_move,
 )
 
 FloatArray = NDArray[np.float64]
@@ -64,8 +67,7 @@ def test_a_fall_in_all_blocks_but_one_is_a_fall() -> None:
     nothing.
     """
     falls = np.array([-30.0, -27.0, -25.0, -24.0, -22.0, -20.0, -19.0, -15.0, -14.0, -3.0])
-    move = np.arange(11)
-    one_rise = compare_by_move(np.append(falls, 76.0), move)
+    one_rise = change_of_blocks(np.append(falls, 76.0))
     assert one_rise.rise < 0.0
     assert abs(one_rise.sigmas) < 1.7  # t(10) at 95 % is 1.8
     assert one_rise.falls(0.95)
@@ -74,27 +76,46 @@ def test_a_fall_in_all_blocks_but_one_is_a_fall() -> None:
 
 def test_a_fall_that_two_blocks_make_alone_is_none() -> None:
     rest = np.array([-13.0, -9.0, -2.0, -3.0, -1.0, 10.0, -4.0])
-    move = np.arange(9)
-    two_falls = compare_by_move(np.append(rest, [-2747.0, -1627.0]), move)
+    two_falls = change_of_blocks(np.append(rest, [-2747.0, -1627.0]))
     assert two_falls.rise < -4000.0
     assert not two_falls.falls(0.95)
 
 
 def test_a_rise_in_total_is_no_fall_of_most_blocks() -> None:
     """Nine moves better and one much worse: the error rises, whatever the trimmed mean says."""
-    move = np.arange(10)
-    change = compare_by_move(np.append(np.full(9, -10.0) + np.arange(9), 200.0), move)
+    change = change_of_blocks(np.append(np.full(9, -10.0) + np.arange(9), 200.0))
     assert change.rise > 0.0
     assert not change.falls(0.95)
 
 
 @given(st.lists(st.floats(-1e3, 1e3), min_size=2, max_size=30))
 def test_a_fall_is_a_rise_of_the_opposite(changes: list[float]) -> None:
-    move = np.arange(len(changes))
-    found = compare_by_move(np.array(changes), move)
-    opposite = compare_by_move(-np.array(changes), move)
+    found = change_of_blocks(np.array(changes))
+    opposite = change_of_blocks(-np.array(changes))
     assert found.falls(0.95) == opposite.rises(0.95)
     assert not (found.falls(0.95) and found.rises(0.95))
+
+
+@given(
+    st.lists(st.tuples(st.floats(-1e3, 1e3), st.integers(0, 6)), min_size=2, max_size=30),
+    st.randoms(use_true_random=False),
+)
+def test_a_change_is_summed_by_move(rows: list[tuple[float, int]], random: Random) -> None:
+    """So few moves stay blocks of their own, in whatever order their rows come."""
+    change = np.array([row[0] for row in rows])
+    move = np.array([row[1] for row in rows])
+    run = np.zeros_like(move)
+    found = compare_by_block(change, move, run)
+    by_move = [change[move == number].sum() for number in np.unique(move)]
+    assert found.rise == pytest.approx(change.sum(), abs=1e-6)
+    assert found.blocks == len(by_move)
+    expected = 0.0
+    if len(by_move) > 1:
+        expected = np.std(by_move, ddof=1) * np.sqrt(len(by_move))
+    assert found.std == pytest.approx(expected, abs=1e-6)
+    order = random.sample(range(len(rows)), len(rows))
+    shuffled = compare_by_block(change[order], move[order], run)
+    assert shuffled.rise == pytest.approx(found.rise, abs=1e-6)
 
 
 @pytest.mark.parametrize("freedom", [3, 30])
@@ -102,7 +123,7 @@ def test_noise_falls_six_times_in_a_hundred_also_with_heavy_tails(freedom: int) 
     """Two tests are made, which nearly always agree: 5 % of each become some 6 % of both."""
     rng = np.random.default_rng(11)
     draws = rng.standard_t(freedom, size=(2000, 12))
-    share = np.mean([compare_by_move(draw, np.arange(12)).falls(0.95) for draw in draws])
+    share = np.mean([change_of_blocks(draw).falls(0.95) for draw in draws])
     assert 0.035 <= share <= 0.075
 
 
@@ -113,9 +134,7 @@ def test_noise_falls_most_often_with_five_blocks(confidence: float, expected: fl
     """
     rng = np.random.default_rng(13)
     draws = rng.standard_normal((3000, FEWEST_BLOCKS))
-    share = np.mean(
-        [compare_by_move(draw, np.arange(FEWEST_BLOCKS)).falls(confidence) for draw in draws]
-    )
+    share = np.mean([change_of_blocks(draw).falls(confidence) for draw in draws])
     assert share == pytest.approx(expected, abs=0.015)  # three deviations of 3000 draws
 
 
@@ -134,11 +153,10 @@ def test_joined_blocks_are_enough_to_judge_by() -> None:
     """
     change = np.array([2.0, 2.0, 2.0, 0.5, -0.5, -2.0, -2.0, -2.0])
     run = np.zeros(8, dtype=np.int64)
-    moves = compare_by_block(change, np.arange(8), run).moves
-    assert moves == 8
+    assert compare_by_block(change, np.arange(8), run).blocks == 8
     twice = np.repeat(change, 2)
     move = np.arange(16)
-    assert compare_by_block(twice, move, np.zeros(16, dtype=np.int64)).moves == 8
+    assert compare_by_block(twice, move, np.zeros(16, dtype=np.int64)).blocks == 8
 
 
 def test_a_rise_that_is_more_than_noise_is_refuted() -> None:
@@ -169,7 +187,7 @@ def test_a_rise_below_a_hundredth_of_the_error_refutes_nothing() -> None:
     rng = np.random.default_rng(2)
     sure = np.full((20, MOTORS), 0.001) + rng.normal(0.0, 1e-5, (20, MOTORS))
     change = _change(sure)
-    assert change.total.is_rise
+    assert change.total.rises(CONFIDENCE)
     assert not change.is_rise
     assert change.worse_motors == ()
     assert judge_change(change)[0] is Judgement.UNDECIDED
@@ -202,11 +220,11 @@ def test_moves_whose_changes_follow_each_other_count_as_one_block() -> None:
     move = np.arange(160)
     run = np.repeat((0, 1), 80)
     joined = compare_by_block(slow, move, run)
-    assert joined.moves <= 20
-    assert joined.std > 2.0 * compare_by_move(slow, move).std
+    assert joined.blocks <= 20
+    assert joined.std > 2.0 * change_of_blocks(slow).std
     assert joined.rise == pytest.approx(slow.sum())
     independent = compare_by_block(rng.normal(size=160), move, run)
-    assert independent.moves == 160
+    assert independent.blocks == 160
 
 
 def test_independent_blocks_keep_the_false_alarm_where_moves_follow_each_other() -> None:
@@ -220,16 +238,16 @@ def test_independent_blocks_keep_the_false_alarm_where_moves_follow_each_other()
     by_block = 0
     for _ in range(200):
         slow = np.repeat(rng.normal(size=20), 16)
-        by_move += compare_by_move(slow, move).is_rise
-        by_block += compare_by_block(slow, move, run).is_rise
+        by_move += change_of_blocks(slow).rises(CONFIDENCE)
+        by_block += compare_by_block(slow, move, run).rises(CONFIDENCE)
     assert by_move > 50
     assert by_block < 26  # 10 expected, 3.1 its deviation; blocks are found by a test, too
 
 
 @given(st.floats(0.1, 1e3), st.floats(0.1, 1e3), st.integers(2, 40))
-def test_a_change_is_no_rise_and_fall_at_once(rise: float, std: float, moves: int) -> None:
-    change = PairedChange(rise, std, moves)
-    mirrored = PairedChange(-rise, std, moves)
+def test_a_change_is_no_rise_and_fall_at_once(rise: float, std: float, blocks: int) -> None:
+    change = PairedChange(rise, std, blocks)
+    mirrored = PairedChange(-rise, std, blocks)
     assert change.rises(0.95) == mirrored.falls(0.95)
     assert not (change.rises(0.95) and change.falls(0.95))
 

@@ -14,7 +14,6 @@ from scipy import linalg
 from ident.data.dataset import Dataset
 from ident.discovery import gates, joining, loop
 from ident.discovery.candidates import SearchProblem, score_candidates
-from ident.discovery.error_change import compare_by_move
 from ident.discovery.evidence import Evidence, gather, with_effects
 from ident.discovery.few_moves import FEWEST_MOVES, moves_behind
 from ident.discovery.gates import (
@@ -237,38 +236,6 @@ def test_of_a_family_the_possible_setting_is_taken(slipping: Evidence) -> None:
     best = rank_effects(search_problem_of(slipping), rng, GATES, (family,))[0]
     expected = (family[1], 1, True)
     assert (best.effect, best.axis, best.passed) == expected
-
-
-@given(st.lists(st.tuples(numbers, st.integers(0, 6)), min_size=2, max_size=30))
-def test_a_change_is_summed_by_move(rows: list[tuple[float, int]]) -> None:
-    change = np.array([row[0] for row in rows])
-    move = np.array([row[1] for row in rows])
-    found = compare_by_move(change, move)
-    by_move = [change[move == number].sum() for number in np.unique(move)]
-    assert found.rise == pytest.approx(change.sum(), abs=1e-6)
-    assert found.moves == len(by_move)
-    if len(by_move) > 1:
-        by_move_std = np.std(by_move, ddof=1)
-        move_count_root = np.sqrt(len(by_move))
-        expected = by_move_std * move_count_root
-    else:
-        expected = 0.0
-    assert found.std == pytest.approx(expected, abs=1e-6)
-    assert not (found.is_rise and compare_by_move(-change, move).is_rise)
-    rng = np.random.default_rng(len(rows))
-    order = rng.permutation(len(rows))
-    assert compare_by_move(change[order], move[order]).rise == pytest.approx(found.rise, abs=1e-6)
-
-
-def test_a_rise_is_more_than_its_noise_once_in_twenty() -> None:
-    rng = np.random.default_rng(4)
-    move = np.repeat(np.arange(12), 5)
-    rises = [
-        compare_by_move(rng.normal(size=60) + rng.normal(size=12)[move], move).is_rise
-        for _ in range(600)
-    ]
-    assert 14 <= sum(rises) <= 46  # 30 ± 5.3, three deviations on either side
-    assert compare_by_move(rng.normal(size=60) + 3.0, move).is_rise
 
 
 def test_runs_are_left_out_where_their_payload_is_in_another(small: Evidence) -> None:

@@ -570,7 +570,7 @@ def test_before_and_after_are_of_the_same_rows() -> None:
     steps = _searched(mistake)
     whole = account(start, steps)
     assert whole.holdout_change is not None
-    assert whole.holdout_change.rise < -2.0 * whole.holdout_change.std
+    assert whole.holdout_change.total.sigmas < -2.0
     assert [placed.effect.name for placed in whole.total.added] == ["late-position"]
     evidence = steps[-1].after
     left_out = left_out_runs(evidence, start.estimate.gains)
