@@ -108,6 +108,8 @@ class Headline:
     effects: tuple[str, ...]  #: each accepted effect with its error before and after
     together: str  #: error of all axes
     judged: tuple[str, ...]  #: effects that held-out runs do not confirm
+    #: what explains the rest of an axis best, with a sign or size that cannot be
+    impossible: tuple[str, ...]
     refused: tuple[str, ...]  #: effects with which `apply` refuses the calibration
     gains: tuple[str, ...]  #: whether gains have changed
     explained: tuple[str, ...]  #: what the fit before the search named, and the search does not
@@ -122,6 +124,7 @@ class Headline:
             *self.explained,
             self.together,
             *self.judged,
+            *self.impossible,
             *self.refused,
         )
         after = (*self.gains, *self.to_record, *self.ending)
@@ -139,10 +142,11 @@ class Headline:
         first = (self.together, *self.refused, *self.checks[:1], *self.ending)
         ordered = (
             *first,
+            *self.judged,
             *self.checks[1:],
             *self.effects,
+            *self.impossible,
             *self.explained,
-            *self.judged,
             *self.gains,
             *self.to_record,
         )
@@ -254,12 +258,14 @@ def turn_sentences(fitted: Fit, step: Step) -> Iterator[str]:
     """Say what a turn of the search added, and what it refused and why."""
     places = fitted.cell.place_names
     for rejected in step.set_aside:
-        name = rejected.finding.placed.name_among(places)
-        yield f"Not added: {name}: {rejected.reason(places)}."
-    if step.accepted is None:
+        finding = rejected.finding
+        name = effect_text(finding.effect, places)
+        yield f"Not added to {places[finding.axis]}: {name}: {rejected.reason(places)}."
+    added = step.accepted
+    if added is None:
         yield "No candidate passes every gate; nothing is added."
     else:
-        yield f"Added: {step.accepted.placed.name_among(places)}."
+        yield f"Added to {places[added.axis]}: {effect_text(added.effect, places)}."
 
 
 def before_after_table(account: Account, axes: tuple[str, ...]) -> Table:
@@ -310,6 +316,7 @@ def headline_of(fitted: Fit, account: Account, effects: Sequence[AcceptedEffect]
         noise = ""
     ending = (*_skew_sentence(account.skew), *_holdout_verdict(fitted, account))
     judged = tuple(verdict_sentences(fitted))
+    impossible = _impossible_sentences(fitted)
     explained = tuple(_explained_checks(fitted, account))
     to_record = tuple(
         f"Excitation: {one.words(fitted.cell.axis_names[one.axis])}." for one in fitted.uncertain
@@ -319,13 +326,25 @@ def headline_of(fitted: Fit, account: Account, effects: Sequence[AcceptedEffect]
         if judged:
             none = "No effect is confirmed"
         together = f"{none}: the error {where} is {after.total:.1f} %{noise}."
-        return Headline(tuple(checks), (), together, judged, (), (), explained, to_record, ending)
+        return Headline(
+            checks=tuple(checks),
+            effects=(),
+            together=together,
+            judged=judged,
+            impossible=impossible,
+            refused=(),
+            gains=(),
+            explained=explained,
+            to_record=to_record,
+            ending=ending,
+        )
     change = error_change_text(before.total, after.total)
     return Headline(
         checks=tuple(checks),
         effects=tuple(found),
         together=f"All axes together: the error {where} {change}{noise}{_unconfirmed(account)}.",
         judged=judged,
+        impossible=impossible,
         refused=tuple(_to_be_refused(effects)),
         gains=(gains_sentence(fitted, account),),  # empty for fixed gains
         explained=explained,
@@ -544,32 +563,47 @@ def _set_aside(fitted: Fit, step: Step) -> Iterator[str]:
             )
 
 
+def _impossible_firsts(fitted: Fit) -> tuple[Finding, ...]:
+    """The first candidate of each axis in the last turn, where physics alone does not allow it."""
+    first: dict[int, Finding] = {}
+    for finding in fitted.steps[-1].findings:
+        first.setdefault(finding.axis, finding)
+    return tuple(
+        finding
+        for finding in first.values()
+        if finding.impossible and finding.refusals == (finding.impossible,)
+    )
+
+
+def _impossible_sentences(fitted: Fit) -> tuple[str, ...]:
+    """Say which effects rank first and cannot be: something else is there that looks like them."""
+    axes = fitted.cell.place_names
+    sentences: list[str] = []
+    for finding in _impossible_firsts(fitted):
+        name = finding.placed.axis_name(axes)
+        sentences.append(
+            f"{name}: {effect_text(finding.effect, axes)} ranks first on this axis, but its sign "
+            f"or size is impossible: {finding.impossible}. The cause may be another one."
+        )
+    return tuple(sentences)
+
+
 def _refused(fitted: Fit) -> Iterator[str]:
     """Sentences on candidates that failed a check: of each axis the strongest, where it would
-    explain much of the residual, and the first one, where physics alone does not allow it.
+    explain much of the residual.
     """
     axes = fitted.cell.place_names
     last = fitted.steps[-1]
     # Those are reported with the reason already.
     reported = [rejected.finding.placed for rejected in last.set_aside]
-    first: dict[int, Finding] = {}
+    reported += [finding.placed for finding in _impossible_firsts(fitted)]
     strongest: dict[int, Finding] = {}
     for finding in last.findings:
-        first.setdefault(finding.axis, finding)
         failed = finding.explained >= MUCH and finding.refusals and finding.placed not in reported
         if failed and (
             finding.axis not in strongest or finding.explained > strongest[finding.axis].explained
         ):
             strongest[finding.axis] = finding
-    for axis, finding in first.items():
-        name = finding.placed.axis_name(axes)
-        if finding.impossible and finding.refusals == (finding.impossible,):
-            yield (
-                f"{name}: {effect_text(finding.effect, axes)} ranks first on this axis, but its "
-                f"sign or size is impossible: {finding.impossible}. The cause may be another one."
-            )
-            if strongest.get(axis) is finding:
-                strongest.pop(axis)
     for finding in strongest.values():
         name = finding.placed.axis_name(axes)
         yield (

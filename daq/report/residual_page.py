@@ -300,11 +300,10 @@ def _turn(fitted: Fit, number: int, step: Step) -> str:
             "the squared noise of one sample as 1."
         )
         ranking = figure(plot_ranking(ranked, rivals, axes), caption)
-    sentences = list(turn_sentences(fitted, step))
     rows = candidate_rows(fitted, step, _SHOWN)
     return folded(
         f"Search, turn {number}: what was tried",
-        html_list(sentences),
+        html_list(turn_sentences(fitted, step)),
         ranking,
         table(f"Turn {number}: {CANDIDATES}", CANDIDATE_HEADINGS, rows, "names"),
     )

@@ -14,7 +14,7 @@ import numpy as np
 from daq.config.cell import Cell, model_of
 from daq.errors import ConfigurationInconsistent
 from daq.workflow.choices import Known
-from daq.workflow.diagnoses import fixed_gains_of, named_causes, nameplate_of
+from daq.workflow.diagnoses import named_causes, nameplate_of
 from daq.workflow.fit import Fit, LogLoader, calibration_of, judged, refuse_effects
 from ident.calibration import Calibration, Parameter, PayloadMass, Source, factor_of
 from ident.equations.reduction import reduce_runs, regrouped
@@ -160,7 +160,7 @@ def essential_fit(fitted: Fit, ratio: float) -> CaseFit:
     refuse_effects(fitted.cell, "--essential")
     before = fitted.identification
     estimate = before.estimate
-    fixed = fixed_gains_of(estimate)
+    fixed = estimate.fixed_gains
     found = essential(
         before.system, lambda system: estimate_with(estimate.method, system, fixed), ratio
     )

@@ -353,18 +353,13 @@ def geometry_beside(evidence: Evidence, seed: int) -> GeometryCheck | None:
         return None
 
 
-def fixed_gains_of(estimate: Estimate) -> FloatArray | None:
-    """Return the gains that an estimate held fixed, shape (n,); None where it found them."""
-    return estimate.gains if estimate.gains_fixed else None
-
-
 def by_likelihood(estimate: Estimate, system: System) -> Estimate:
     """Return the estimate of a system by ``ml``, in whose terms candidates are judged,
     or itself if it is by ``ml``.
     """
     if estimate.method is Method.ML:
         return estimate
-    return estimate_with(Method.ML, system, fixed_gains_of(estimate))
+    return estimate_with(Method.ML, system, estimate.fixed_gains)
 
 
 def check_diagnoses(check: GeometryCheck, cell: Cell, model: Model) -> tuple[Diagnosis, ...]:

@@ -33,7 +33,7 @@ from ident.discovery.candidates import ColumnCache
 from ident.discovery.effect_verdict import EffectVerdict, Judgement, judge_change
 from ident.discovery.evidence import Evidence, place_names, with_effects
 from ident.discovery.gates import Gates
-from ident.discovery.joining import UNFITTED, linearised
+from ident.discovery.joining import UNFITTED, JointFit, linearised
 from ident.discovery.loop import Step, end_search
 from ident.effects.effect import PlacedEffect
 from ident.effects.geometry_corrections import is_correction
@@ -81,33 +81,27 @@ def accept_on_holdout(
         return tuple(steps)
     names = place_names(start.model, axes)
     verdicts: dict[PlacedEffect, EffectVerdict] = {}
-    judged_model = found
     bootstrap = rng or np.random.default_rng(0)
     last = steps[-1]
+    to_judge = found
     while True:
-        left = _judged(
+        confirmed = _judged(
             start,
-            judged_model,
+            to_judge,
             verdicts,
             write_undecided=write_undecided,
             progress=progress,
             names=names,
         )
-        if left.effects != last.after.effects:
-            refitted = start
-            if left is not start:
-                refitted = replace(with_effects(found, left.effects), declared=found.declared)
-            undecided = _undecided(found, left, verdicts)
-            opened = tuple(dict.fromkeys((*last.left_open, *undecided)))
-            dropped = last.set_aside[len(steps[-1].set_aside) :]
-            model = linearised(refitted, ColumnCache())
-            last = end_search(steps, model, gates or Gates(), rng=bootstrap, left_open=opened)
-            last = replace(last, set_aside=(*last.set_aside, *dropped))
-        # An effect that passes no longer in this fit has left: those beside it are judged again
-        # without it.
-        if len(last.after.effects) >= len(left.effects):
+        if confirmed.effects != last.after.effects:
+            undecided = _undecided(found, confirmed, verdicts)
+            model = _fitted_again(start, found, confirmed)
+            last = _ended_again(steps, last, model, gates or Gates(), bootstrap, undecided)
+        # What no longer passes in this fit has left: the effects beside it are judged again.
+        is_pruned = len(last.after.effects) < len(confirmed.effects)
+        if not is_pruned:
             break
-        judged_model = last.after
+        to_judge = last.after
     written = last.after.effects
     ordered: list[EffectVerdict] = []
     for placed in found.effects:
@@ -115,6 +109,40 @@ def accept_on_holdout(
             verdict = replace(verdicts[placed], written=placed in written)
             ordered.append(verdict)
     return (*steps[:-1], replace(last, verdicts=tuple(ordered)))
+
+
+def _fitted_again(start: Evidence, found: Evidence, confirmed: Evidence) -> JointFit:
+    """The model of the search refitted with the confirmed effects alone."""
+    if confirmed is start:
+        refitted = start
+    else:
+        refitted = replace(with_effects(found, confirmed.effects), declared=found.declared)
+    return linearised(refitted, ColumnCache())
+
+
+def _ended_again(
+    steps: Sequence[Step],
+    last: Step,
+    model: JointFit,
+    gates: Gates,
+    rng: np.random.Generator,
+    undecided: Sequence[PlacedEffect],
+) -> Step:
+    """The end of the search with fewer effects: what fails its gates now leaves, too.
+
+    Args:
+        steps: of the search.
+        last: the end before, of the search or of an earlier call.
+        model: with the effects that are left.
+        gates: of the search.
+        rng: of the bootstrap.
+        undecided: effects that have left and may be true.
+    """
+    left_open = tuple(dict.fromkeys((*last.left_open, *undecided)))
+    # Each end begins with what the search has set aside; earlier calls have set aside more.
+    aside_by_earlier = last.set_aside[len(steps[-1].set_aside) :]
+    ended = end_search(steps, model, gates, rng=rng, left_open=left_open)
+    return replace(ended, set_aside=(*ended.set_aside, *aside_by_earlier))
 
 
 def _undecided(
@@ -252,11 +280,8 @@ def _without(evidence: Evidence, left_out: PlacedEffect) -> Evidence:
     holdout = evidence.holdout
     if holdout is not None:
         holdout = replace(holdout, columns=training.columns, effects=holdout.effects[:, stays])
-    if evidence.estimate.gains_fixed:
-        fixed = evidence.estimate.gains
-    else:
-        fixed = None
-    estimate = estimate_with(evidence.estimate.method, training.system(), fixed)
+    described = evidence.estimate
+    estimate = estimate_with(described.method, training.system(), described.fixed_gains)
     return replace(evidence, training=training, holdout=holdout, effects=others, estimate=estimate)
 
 

@@ -239,11 +239,8 @@ def _error_without(evidence: Evidence, left_out: int) -> CurrentError:
     is_last = observation.run == len(others)
     training = observation.only(~is_last)
     held = observation.only(is_last)
-    if evidence.estimate.gains_fixed:
-        fixed = evidence.estimate.gains
-    else:
-        fixed = None
-    estimate = estimate_with(evidence.estimate.method, training.system(), fixed)
+    of_all = evidence.estimate
+    estimate = estimate_with(of_all.method, training.system(), of_all.fixed_gains)
     bare = replace(
         evidence,
         datasets=tuple(evidence.datasets[index] for index in order),

@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ident.discovery.evidence import Evidence, fixed_gains
+from ident.discovery.evidence import Evidence
 from ident.effects.effect import Effect, Property
 from ident.effects.signals import Abscissa
 from ident.effects.unnamed import is_unnamed
@@ -52,4 +52,4 @@ def fitted_clear_of_stops(evidence: Evidence) -> Estimate:
         RankDeficient, NotConverged: these rows do not determine it.
     """
     system = rows_clear_of_stops(evidence).system()
-    return estimate_with(evidence.estimate.method, system, fixed_gains(evidence))
+    return estimate_with(evidence.estimate.method, system, evidence.estimate.fixed_gains)

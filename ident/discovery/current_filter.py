@@ -31,7 +31,7 @@ from ident.arrays import BoolArray, FloatArray, IntArray, takes
 from ident.data.conditioning import Conditioning, as_recorded, low_pass, rows_lost
 from ident.discovery.before_after import squares_left
 from ident.discovery.error_change import ErrorChange, change_of_errors
-from ident.discovery.evidence import Evidence, fixed_gains
+from ident.discovery.evidence import Evidence
 from ident.discovery.joining import UNFITTED
 from ident.discovery.late_currents import rough_torque_rates
 from ident.equations.observation import Observation, observe
@@ -221,7 +221,7 @@ class _Trials:
 def _estimate(evidence: Evidence, rows: Observation) -> tuple[Estimate, IntArray]:
     """Estimate by rows, and the number of rows of each motor."""
     system = rows.system()
-    estimate = estimate_with(Method.ML, system, fixed_gains(evidence))
+    estimate = estimate_with(Method.ML, system, evidence.estimate.fixed_gains)
     return estimate, system.motors.rows
 
 

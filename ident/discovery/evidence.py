@@ -226,6 +226,8 @@ def with_corrections(before: Evidence, corrections: tuple[PlacedEffect, ...]) ->
     system = regrouped(reduce_built(model, of_fit, payloads=before.training.payloads))
     observation = observe(model, datasets, conditioning, system, rows)
     training, holdout = _split_holdout(observation, before.held_out)
+    earlier = before.estimate
+    estimate = estimate_with(earlier.method, training.system(), earlier.fixed_gains)
     return replace(
         before,
         model=model,
@@ -234,7 +236,7 @@ def with_corrections(before: Evidence, corrections: tuple[PlacedEffect, ...]) ->
         training=training,
         holdout=holdout,
         effects=(),
-        estimate=estimate_with(before.estimate.method, training.system(), fixed_gains(before)),
+        estimate=estimate,
         corrections=corrections,
         uncorrected=given if corrections else None,
     )
@@ -280,13 +282,6 @@ def _relinearised(found: Evidence) -> tuple[PlacedEffect, ...] | None:
     return tuple(effects) if is_moved else None
 
 
-def fixed_gains(evidence: Evidence) -> FloatArray | None:
-    """Gains that the fit holds; None where it finds them."""
-    if evidence.estimate.gains_fixed:
-        return evidence.estimate.gains
-    return None
-
-
 def _refitted(
     before: Evidence, effects: tuple[PlacedEffect, ...], runs: Sequence[Signals]
 ) -> Evidence:
@@ -321,7 +316,7 @@ def refitted_around(
     if effects:
         torque = _torques(effects, around, around.fit_runs, session_began_s(around.fit_runs), runs)
         training = training.extended(_columns_of(around.model, effects), torque)
-    estimate = estimate_with(around.estimate.method, training.system(), fixed_gains(around))
+    estimate = estimate_with(around.estimate.method, training.system(), around.estimate.fixed_gains)
     return replace(around, training=training, holdout=unseen, effects=effects, estimate=estimate)
 
 
@@ -345,7 +340,7 @@ def by_instruments(evidence: Evidence) -> Estimate | None:
     estimate = evidence.estimate
     if system is None:
         return None
-    return estimate_with(Method.IV, system, estimate.gains if estimate.gains_fixed else None)
+    return estimate_with(Method.IV, system, estimate.fixed_gains)
 
 
 def _with_instruments(evidence: Evidence) -> System | None:

@@ -25,7 +25,7 @@ import numpy as np
 from ident.arrays import FloatArray
 from ident.discovery.alike_corrections import alike_corrections, axes_to_move, explains_beside
 from ident.discovery.candidates import FamilyTrials, SearchProblem, folds_around
-from ident.discovery.evidence import Evidence, coefficients_of, fixed_gains, with_effects
+from ident.discovery.evidence import Evidence, coefficients_of, with_effects
 from ident.discovery.gates import Gates, certain_delays, impossible, in_noise, own_unknowns
 from ident.discovery.joining import SHOWN, UNFITTED, refuted_by_instruments
 from ident.discovery.late_currents import (
@@ -631,7 +631,7 @@ def _gravity(evidence: Evidence, problem: SearchProblem) -> Gravity | None:
         return None
     training = evidence.training.extended(placed.columns, torque_nm)
     try:
-        estimate = estimate_with(Method.ML, training.system(), fixed_gains(evidence))
+        estimate = estimate_with(Method.ML, training.system(), evidence.estimate.fixed_gains)
     except UNFITTED:
         return None
     declared_m_s2 = evidence.model.robot.gravity_m_s2

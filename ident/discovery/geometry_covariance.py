@@ -104,11 +104,8 @@ def _estimated(
     model = model_with_geometry(described, changes)
     of_fit = datasets[: len(found.system.runs)]
     system = observe(model, of_fit, found.conditioning, found.system).system()
-    if found.estimate.gains_fixed:
-        fixed = found.estimate.gains
-    else:
-        fixed = None
-    return _gains_and_parameters(estimate_with(found.estimate.method, system, fixed))
+    first = found.estimate
+    return _gains_and_parameters(estimate_with(first.method, system, first.fixed_gains))
 
 
 def with_geometry_covariance(found: Identification, covariance: FloatArray) -> Identification:

@@ -81,6 +81,13 @@ class Estimate:
     iterations: int = 0  #: of an iterative estimator
 
     @property
+    def fixed_gains(self) -> FloatArray | None:
+        """The gains that were given, shape (m,); None where they were estimated."""
+        if self.gains_fixed:
+            return self.gains
+        return None
+
+    @property
     def gains_std(self) -> FloatArray:
         """σ of each gain, shape (m,)."""
         return np.sqrt(np.diag(self.covariance)[: len(self.gains)])
