@@ -279,12 +279,15 @@ def test_a_setting_that_a_drive_refuses_is_named_and_the_others_are_restored(
         before.append([node.value(*key) for key in settings])
     with pytest.raises(SetupRefused) as refused, network:
         network.prepare()
+    after = []
+    for node in bus.nodes:
+        after.append([node.value(*key) for key in settings])
     said = str(refused.value)
     assert said.startswith("J2 (node 2): found")
     for part in (found, "present device state", expected, remedy):
         assert part in said
     assert getattr(refused.value, "__notes__", []) == []
-    assert [[node.value(*key) for key in settings] for node in bus.nodes] == before
+    assert after == before
 
 
 @pytest.mark.parametrize(("modes", "named"), [(0b1, False), (0b1000_0000, True)])

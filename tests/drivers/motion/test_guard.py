@@ -164,9 +164,9 @@ def test_a_node_id_that_another_device_uses_is_not_the_recorder_s(
     with network:
         network.prepare()
         assert network.recorder_id == 125
-        watched = [[node.value(0x1016, sub) for sub in (1, 2)] for node in bus.nodes[:2]]
-        expected = [[RECORDER << 16 | 500, 125 << 16 | 500]] * 2
-        assert watched == expected
+        for node in bus.nodes[:2]:
+            assert node.value(0x1016, 1) == RECORDER << 16 | 500
+            assert node.value(0x1016, 2) == 125 << 16 | 500
         pacing = LockstepSync(PERIOD_NS, 0.005, clock=bus.clock)
         stream = SyncStream(network, pacing)
         target_counts = (50_000, -40_000)
@@ -174,9 +174,9 @@ def test_a_node_id_that_another_device_uses_is_not_the_recorder_s(
         list(execute(network, stream, (move,), permission()))
         beats = {frame.arbitration_id for frame in bus.sent if frame.arbitration_id > 0x700}
         assert beats == {0x700 + 125}
-    assert [[node.value(0x1016, sub) for sub in (1, 2)] for node in bus.nodes[:2]] == [
-        [RECORDER << 16 | 500, 0]
-    ] * 2
+    for node in bus.nodes[:2]:
+        assert node.value(0x1016, 1) == RECORDER << 16 | 500
+        assert node.value(0x1016, 2) == 0
 
 
 def test_a_node_id_that_an_amplifier_waits_for_is_left_to_the_device_that_is_off_now() -> None:

@@ -104,9 +104,9 @@ def test_the_time_limit_of_a_stop_ends_with_a_stop_that_is_confirmed(moving: Mov
 def test_the_profile_objects_are_those_of_the_move(moving: Moving) -> None:
     _, _, bus, _ = moving
     run(moving, FAR)
-    written = [
-        tuple(node.value(index, 0) for index in (0x6081, 0x6083, 0x6084)) for node in bus.nodes
-    ]
+    written = []
+    for node in bus.nodes:
+        written.append((node.value(0x6081, 0), node.value(0x6083, 0), node.value(0x6084, 0)))
     assert written == [(100_000, 1_000_000, 1_000_000), (80_000, 800_000, 800_000)]
 
 

@@ -79,10 +79,11 @@ def settings(network: CanopenNetwork) -> list[tuple[bytes, ...]]:
         (0x1400, 2),
         (0x1600, 0),
     )
-    return [
-        tuple(network.link.objects(node_id).read_bytes(index, sub) for index, sub in objects)
-        for node_id in network.node_ids
-    ]
+    found = []
+    for node_id in network.node_ids:
+        node = network.link.objects(node_id)
+        found.append(tuple(node.read_bytes(index, sub) for index, sub in objects))
+    return found
 
 
 @pytest.mark.slow

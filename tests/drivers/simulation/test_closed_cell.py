@@ -64,7 +64,7 @@ def test_moves_are_reached_and_the_loops_stay_closed(
                 assert master.write(node, index, 0, kind, value) == 0
         master.control(nodes, 0x1F)
         answers = [master.sync(len(spec.axes)) for _ in range(450)]
-        words = np.array([[word for _, _, word in answer] for answer in answers])
+        words = np.array(answers)[:, :, 2]
         last_word = words[-1]
         assert (last_word & REACHED).all()
         assert not (words & FOLLOWING_ERROR).any()

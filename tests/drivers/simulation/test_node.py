@@ -222,6 +222,9 @@ def test_no_object_reports_the_true_gain(request: pytest.FixtureRequest) -> None
             known = [
                 key for key in entries if key in cell.nodes[0]._dictionary and key != (0x1003, 1)
             ]
-            reported.append([node.read(*key) for node in cell.nodes for key in known])
+            objects: list[bytes] = []
+            for node in cell.nodes:
+                objects += [node.read(*key) for key in known]
+            reported.append(objects)
     assert len(reported[0]) > 200
     assert reported[0] == reported[1]

@@ -66,18 +66,13 @@ def test_inverse_dynamics_gives_back_the_applied_torque(payload: str | None) -> 
     plant.set_brakes(OPEN)
     model, data = links(spec)
     rows = motor_rows(spec.ratio)
-    gain, inertia, viscous, coulomb, motor_viscous, motor_coulomb, offset = (
-        np.array([getattr(axis, name) for axis in spec.axes])
-        for name in (
-            "gain_nm_per_a",
-            "motor_inertia_kg_m2",
-            "viscous_nm_s_rad",
-            "coulomb_nm",
-            "motor_viscous_nm_s_rad",
-            "motor_coulomb_nm",
-            "offset_nm",
-        )
-    )
+    gain = np.array([axis.gain_nm_per_a for axis in spec.axes])
+    inertia = np.array([axis.motor_inertia_kg_m2 for axis in spec.axes])
+    viscous = np.array([axis.viscous_nm_s_rad for axis in spec.axes])
+    coulomb = np.array([axis.coulomb_nm for axis in spec.axes])
+    motor_viscous = np.array([axis.motor_viscous_nm_s_rad for axis in spec.axes])
+    motor_coulomb = np.array([axis.motor_coulomb_nm for axis in spec.axes])
+    offset = np.array([axis.offset_nm for axis in spec.axes])
     step_s = 0.25e-3
     checked = 0
     for k in range(1200):

@@ -7,6 +7,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
+from itertools import product
 
 import can
 import pytest
@@ -125,9 +126,7 @@ def test_a_lost_answer_delays_nothing_and_its_object_is_read_again(bench: Bench)
     given_up = GIVEN_UP_NS // scripted.PERIOD_NS
     waited = [r for r in bench.readings if r.time_ns < samples[given_up].time_ns]
     assert waited == []
-    assert {(r.axis, r.quantity) for r in bench.readings} == {
-        (a, q) for a in (0, 1) for q in Quantity
-    }
+    assert {(r.axis, r.quantity) for r in bench.readings} == set(product((0, 1), Quantity))
 
 
 def test_no_request_goes_with_a_set_point_and_none_after_the_stop(bench: Bench) -> None:
