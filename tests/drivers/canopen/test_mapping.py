@@ -24,13 +24,15 @@ entries = st.builds(
 def test_everything_is_packed_once_and_fits(objects: list[ObjectEntry]) -> None:
     pdos = pack(objects)
     packed = list(chain.from_iterable(pdos))
-    assert sorted(map(word, objects)) == sorted(map(word, packed))
+    expected = sorted(map(word, packed))
+    assert sorted(map(word, objects)) == expected
     for pdo in pdos:
         assert sum(entry.bits for entry in pdo) <= 64
     # First fit: what opened a later PDO had no room in an earlier one.
     for number, pdo in enumerate(pdos[1:], start=1):
         for earlier in pdos[:number]:
-            assert sum(entry.bits for entry in earlier) + pdo[0].bits > 64
+            bits = pdo[0].bits
+            assert sum(entry.bits for entry in earlier) + bits > 64
 
 
 @given(st.lists(entries, min_size=1, max_size=6, unique_by=word), st.data())
@@ -38,14 +40,15 @@ def test_layout_decodes_what_a_drive_would_send(
     objects: list[ObjectEntry], data: st.DataObject
 ) -> None:
     for pdo in pack(objects):
-        values = [
-            data.draw(
-                st.integers(-(1 << entry.bits - 1), (1 << entry.bits - 1) - 1)
-                if entry.signed
-                else st.integers(0, (1 << entry.bits) - 1)
+        values = []
+        for entry in pdo:
+            values.append(
+                data.draw(
+                    st.integers(-(1 << entry.bits - 1), (1 << entry.bits - 1) - 1)
+                    if entry.signed
+                    else st.integers(0, (1 << entry.bits) - 1)
+                )
             )
-            for entry in pdo
-        ]
         payload = b"".join(
             value.to_bytes(entry.bits // 8, "little", signed=entry.signed)
             for value, entry in zip(values, pdo, strict=True)
