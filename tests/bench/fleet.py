@@ -97,9 +97,9 @@ def main() -> int:
         "equal": equal,
         "load": os.getloadavg(),
     }
-    medians = {
-        name: statistics.median(run["seconds"] for run in several) for name, several in runs.items()
-    }
+    medians = {}
+    for name, several in runs.items():
+        medians[name] = statistics.median(run["seconds"] for run in several)
     found |= {"seconds": medians, "ratio": medians["processes 1"] / medians["processes 2"]}
     print_line(json.dumps(found) if arguments.json else summary_text(found))
     return 0 if equal == len(names) else 1

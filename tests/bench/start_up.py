@@ -36,10 +36,10 @@ def start_up(out: Path, log: Path, repeats: int, environment: dict[str, str]) ->
         "info": ["info", str(log)],
         "history": ["history", cell],
     }
-    return {
-        name: statistics.median(_seconds(command, environment) for _ in range(repeats))
-        for name, command in commands.items()
-    }
+    medians_s = {}
+    for name, command in commands.items():
+        medians_s[name] = statistics.median(_seconds(command, environment) for _ in range(repeats))
+    return medians_s
 
 
 def _seconds(command: list[str], environment: dict[str, str]) -> float:

@@ -102,10 +102,11 @@ def test_agrees_with_dense_least_squares() -> None:
     fit = fit_torques(robot, pieces)
     assert len(fit.values) == 58
     torque = np.concatenate([measured for _, measured in pieces], axis=1)
-    parts = ("position_rad", "velocity_rad_s", "acceleration_rad_s2")
-    whole = Motion(
-        *(np.concatenate([getattr(motion, part) for motion, _ in pieces]) for part in parts)
-    )
+    motions = [motion for motion, _ in pieces]
+    position_rad = np.concatenate([motion.position_rad for motion in motions])
+    velocity_rad_s = np.concatenate([motion.velocity_rad_s for motion in motions])
+    acceleration_rad_s2 = np.concatenate([motion.acceleration_rad_s2 for motion in motions])
+    whole = Motion(position_rad, velocity_rad_s, acceleration_rad_s2)
     rows = standard_rows(robot, 6000)
     fill_rows(robot, whole, rows)
     dense = np.moveaxis(rows, 1, 2).reshape(-1, rows.shape[1])

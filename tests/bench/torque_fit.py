@@ -50,11 +50,10 @@ class TorqueFit:
 
 def names(joints: int) -> tuple[str, ...]:
     """Names of the standard parameters, joint by joint."""
-    return tuple(
-        f"{name}{number + 1}"
-        for number in range(joints)
-        for name in LINK_PARAMETERS + DRIVE_PARAMETERS
-    )
+    found: list[str] = []
+    for number in range(1, joints + 1):
+        found += [f"{name}{number}" for name in LINK_PARAMETERS + DRIVE_PARAMETERS]
+    return tuple(found)
 
 
 def standard_rows(robot: Robot, samples: int) -> FloatArray:

@@ -20,7 +20,7 @@ import time
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import ExitStack
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 
 from tests.chaos import clock
@@ -145,7 +145,7 @@ def possible_kinds(bus: ChaosBus, has_clock: bool) -> tuple[Act | Inside, ...]:
 
 def summary(seed: int, done: list[Row]) -> Iterator[str]:
     """Lines about all rounds of a seed."""
-    kinds = Counter(name for row in done for name in row.faults)
+    kinds = Counter(chain.from_iterable(row.faults for row in done))
     codes = Counter(row.code for row in done)
     values = sum(row.values for row in done)
     yield (

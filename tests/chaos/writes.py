@@ -18,7 +18,10 @@ from tests.chaos.processes import Verb
 from tests.daq.calibrations import IDENTIFIED, calibration_for
 
 FACTORS = (1.0, 1.02)
-WRITTEN_GAINS = tuple(tuple(factor * gain for gain in IDENTIFIED) for factor in FACTORS)
+WRITTEN_GAINS = (
+    tuple(FACTORS[0] * gain for gain in IDENTIFIED),
+    tuple(FACTORS[1] * gain for gain in IDENTIFIED),
+)
 WRITE_S = 60.0
 
 

@@ -10,6 +10,7 @@ import inspect
 import pickle
 import pkgutil
 from collections.abc import Iterator
+from itertools import chain
 from typing import Any
 
 import pytest
@@ -44,11 +45,8 @@ def _kinds() -> tuple[type[Exception], ...]:
     for package in (daq, drivers, ident):
         for module in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
             importlib.import_module(module.name)
-    return tuple(
-        sorted(
-            {kind for root in ROOTS for kind in _below(root)}, key=lambda kind: kind.__qualname__
-        )
-    )
+    kinds = set(chain.from_iterable(_below(root) for root in ROOTS))
+    return tuple(sorted(kinds, key=lambda kind: kind.__qualname__))
 
 
 def _below(kind: type[Any]) -> Iterator[type[Exception]]:

@@ -35,17 +35,18 @@ def demo_content(checkout: Path, payload: Payload | None = None) -> LogContent:
 
 def samples(rows: Sequence[Sequence[int]], status: int = 0x1237, missing: int = 0) -> list[Sample]:
     """One sample a millisecond with these counts; the current is the negative count."""
-    return [
-        Sample(
-            10 + k,
-            START_NS + k * 1_000_000,
-            tuple(row),
-            tuple(-c for c in row),
-            (status,) * len(row),
-            missing,
-        )
-        for k, row in enumerate(rows)
-    ]
+    found = []
+    for k, row in enumerate(rows):
+        time_ns = START_NS + k * 1_000_000
+        current_raw = tuple(-count for count in row)
+        statusword = (status,) * len(row)
+        found.append(Sample(10 + k, time_ns, tuple(row), current_raw, statusword, missing))
+    return found
+
+
+def rising_counts(rows: int, axes: int) -> list[list[int]]:
+    """Counts of so many rows: row k begins with 100 k, and each axis has one count more."""
+    return [list(range(100 * row, 100 * row + axes)) for row in range(rows)]
 
 
 def joints(counts: Sequence[int]) -> list[float]:

@@ -4,6 +4,7 @@ verbs and options in the place of functions and arguments.
 
 from __future__ import annotations
 
+from itertools import chain
 from pathlib import Path
 
 import pytest
@@ -21,11 +22,8 @@ ROOT = Path(__file__).parents[2]
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_every_name_of_the_table_is_in_a_message(name: str) -> None:
-    code = "".join(
-        file.read_text()
-        for folder in ("ident", "drivers")
-        for file in (ROOT / folder).rglob("*.py")
-    )
+    files = chain((ROOT / "ident").rglob("*.py"), (ROOT / "drivers").rglob("*.py"))
+    code = "".join(file.read_text() for file in files)
     assert name in code
 
 

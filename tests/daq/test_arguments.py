@@ -71,7 +71,16 @@ def _right_arguments() -> dict[str, dict[str, Any]]:
 
 
 RIGHT = _right_arguments()
-CASES = [(function, name) for function, arguments in RIGHT.items() for name in arguments]
+
+
+def _cases() -> list[tuple[str, str]]:
+    found = []
+    for function, arguments in RIGHT.items():
+        found += [(function, name) for name in arguments]
+    return found
+
+
+CASES = _cases()
 WRONG: tuple[Any, ...] = (
     3.5,
     -1,

@@ -69,10 +69,10 @@ class BusContract:
 
     def test_a_long_burst_loses_nothing(self, ends: Ends) -> None:
         sender, *others = ends
-        burst = [
-            can.Message(arbitration_id=n & 0x7FF, is_extended_id=False, data=n.to_bytes(8, "big"))
-            for n in range(3000)
-        ]
+        burst = []
+        for n in range(3000):
+            data = n.to_bytes(8, "big")
+            burst.append(can.Message(arbitration_id=n & 0x7FF, is_extended_id=False, data=data))
         for start in range(0, 3000, 100):
             send_burst(sender, burst[start : start + 100])
         for end in others:

@@ -170,7 +170,8 @@ class ScriptedNode:
             return 0x06090030
         if sub:
             return 0x06010000 if self.value(index, 0) else 0
-        bits = sum(self.value(index, entry + 1) & 0xFF for entry in range(data[4]) if data[4] <= 8)
+        entries = range(data[4])
+        bits = sum(self.value(index, entry + 1) & 0xFF for entry in entries if data[4] <= 8)
         return 0x06040042 if bits > self.largest_pdo_bits else 0
 
     def _refresh(self) -> None:
@@ -179,11 +180,13 @@ class ScriptedNode:
                 self.store(*key, value)
 
     def _mapped(self, base: int, number: int) -> list[tuple[int, int, int]]:
-        words = [
-            self.value(base + 0x200 + number, sub + 1)
-            for sub in range(self.value(base + 0x200 + number, 0))
-        ]
-        return [(w >> 16, w >> 8 & 0xFF, (w & 0xFF) // 8) for w in words]
+        words = []
+        for sub in range(self.value(base + 0x200 + number, 0)):
+            words.append(self.value(base + 0x200 + number, sub + 1))
+        found = []
+        for w in words:
+            found.append((w >> 16, w >> 8 & 0xFF, (w & 0xFF) // 8))
+        return found
 
     def receive_pdo(self, cob_id: int, data: bytes) -> None:
         if self.nmt == 5:

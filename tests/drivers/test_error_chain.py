@@ -31,7 +31,8 @@ def test_a_chain_with_sdo_aborts_has_every_error_once() -> None:
     access.__cause__ = abort
     abort.__context__ = again
     chain = error_chain(access)
-    assert [id(error) for error in chain] == [id(access), id(abort), id(again)]
+    expected = [id(access), id(abort), id(again)]
+    assert [id(error) for error in chain] == expected
 
 
 def test_a_chain_that_is_a_cycle_ends() -> None:

@@ -87,7 +87,9 @@ def test_a_node_on_the_other_bus_is_named_with_both() -> None:
     assert str(error).startswith(
         "J4 (node 4) is heard on bus can1, the cell configuration has it on bus can0"
     )
-    assert (error.node_id, error.expected, error.found) == (4, "can0", "can1")
+    assert error.node_id == 4
+    assert error.expected == "can0"
+    assert error.found == "can1"
 
 
 def test_an_sdo_that_failed_names_node_object_and_abort_code() -> None:
@@ -123,7 +125,9 @@ def test_a_state_that_was_not_reached_says_what_was_read(
 ) -> None:
     error = StateRefused(2, "SWITCHED ON", "FAULT", statusword, remedy=remedy)
     assert str(error) == f"node 2: asked for SWITCHED ON, {ending}"
-    assert (error.asked, error.found, error.statusword) == ("SWITCHED ON", "FAULT", statusword)
+    assert error.asked == "SWITCHED ON"
+    assert error.found == "FAULT"
+    assert error.statusword == statusword
 
 
 def test_drives_of_which_some_have_new_values_are_told_apart() -> None:
@@ -148,7 +152,8 @@ def test_a_fault_says_that_all_axes_stop_and_carries_its_codes() -> None:
 def test_a_lost_sample_names_the_silent_axes_or_says_that_none_answers() -> None:
     error = SampleLost(12, (1, 2), ("J2", "J3"))
     assert str(error) == "cycle 12: no answer from J2, J3"
-    assert (error.cycle, error.axes) == (12, (1, 2))
+    assert error.cycle == 12
+    assert error.axes == (1, 2)
     silent = SampleLost(12, (0, 1, 2), ("J1", "J2", "J3"), 0.12345)
     assert str(silent).startswith("cycle 12: no axis answered within 0.123 s; check the power")
 
@@ -179,7 +184,8 @@ def test_a_late_move_says_what_did_not_come(
     error = MotionTimeout(3, (1,), [J2], 2.5, acknowledge)
     expected = f"move 3: J2 (node 2) {found} within 2.5 s; stopping all axes; {remedy}"
     assert str(error).startswith(expected)
-    assert (error.move, error.axes) == (3, (1,))
+    assert error.move == 3
+    assert error.axes == (1,)
 
 
 def test_a_late_move_beside_another_master_names_it_first() -> None:

@@ -100,15 +100,19 @@ class Outcome:
 
 def settings_of(cell: SimulatedCell) -> Settings:
     """Settings of each node that a recording changes and must restore."""
-    return tuple(
-        (
-            *(_pdo(node, base, number) for base in (0x1400, 0x1800) for number in range(4)),
-            tuple(
-                _value(node, *key) for key in ((0x1016, 1), (0x1017, 0), (0x6007, 0), (0x6060, 0))
-            ),
-        )
-        for node in cell.nodes
+    return tuple(_settings_of_node(node) for node in cell.nodes)
+
+
+def _settings_of_node(node: Node) -> tuple[tuple[bytes, ...], ...]:
+    received = [_pdo(node, 0x1400, number) for number in range(4)]
+    sent = [_pdo(node, 0x1800, number) for number in range(4)]
+    others = (
+        _value(node, 0x1016, 1),
+        _value(node, 0x1017, 0),
+        _value(node, 0x6007, 0),
+        _value(node, 0x6060, 0),
     )
+    return (*received, *sent, others)
 
 
 def _pdo(node: Node, base: int, number: int) -> tuple[bytes, ...]:

@@ -8,6 +8,7 @@ import json
 import re
 import socket
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 
 import can
@@ -323,7 +324,7 @@ def test_the_faults_of_a_scenario_file_come_on_top_of_those_of_the_simulation(
 def test_the_example_names_every_kind_of_fault() -> None:
     text = shipped_simulation("faults-example").read_text(encoding="utf-8")
     words = set(re.findall(r"^#   ?([a-z-]+)  |  ([a-z-]+)  ", text, re.MULTILINE))
-    assert {kind.value for kind in FaultKind} <= {word for pair in words for word in pair}
+    assert {kind.value for kind in FaultKind} <= set(chain.from_iterable(words))
     assert load_scenario(shipped_simulation("faults-example"), 6, 1000) == (
         FaultSpec(FaultKind.LOST, 1, 1500, 1),
         FaultSpec(FaultKind.EMERGENCY, 2, 4000, None, 0x7305),

@@ -66,18 +66,14 @@ def test_errors_are_as_large_as_their_sigma(
     small_truth: Truth, cells: tuple[WeighedCell, ...]
 ) -> None:
     """`make weigh-study` counts a hundred cells."""
-    scores = np.array(
-        [
-            _scores(
-                cell,
-                weigh(
-                    cell.calibration, small_truth.model, [cell.loaded], cell.conditioning, bare=bare
-                ),
+    scores_of_cells = []
+    for cell in cells:
+        for bare in ([], [cell.bare]):
+            weighed = weigh(
+                cell.calibration, small_truth.model, [cell.loaded], cell.conditioning, bare=bare
             )
-            for cell in cells
-            for bare in ([], [cell.bare])
-        ]
-    )
+            scores_of_cells.append(_scores(cell, weighed))
+    scores = np.array(scores_of_cells)
     rms_scores = np.sqrt(np.mean(scores**2))
     assert 0.5 < rms_scores < 1.6
     assert np.abs(scores).max() < 4.0

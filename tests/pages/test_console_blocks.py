@@ -127,7 +127,9 @@ def test_the_commands_of_a_page_continue_the_tutorial(
 def test_a_saved_block_is_run_by_a_command_of_its_page() -> None:
     for page in pages(DOCS):
         source = page.read_text(encoding="utf-8")
-        words = [word for command in typed(page) for word in shlex.split(command.text)]
+        words: set[str] = set()
+        for command in typed(page):
+            words.update(shlex.split(command.text))
         for block in blocks_of(source):
             assert block.saved_as is None or block.saved_as in words, page
 

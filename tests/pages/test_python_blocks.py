@@ -14,11 +14,18 @@ from docs.reference_pages import API_PAGES, api_names
 from tests.pages.blocks import blocks_of, needed_packages, pages, python_before
 
 ROOT = Path(__file__).parents[2]
-WITH_PYTHON = [
-    page
-    for page in pages(ROOT / "docs")
-    if any(block.runs_here for block in blocks_of(page.read_text(encoding="utf-8")))
-]
+
+
+def _with_python() -> list[Path]:
+    found = []
+    for page in pages(ROOT / "docs"):
+        blocks = blocks_of(page.read_text(encoding="utf-8"))
+        if any(block.runs_here for block in blocks):
+            found.append(page)
+    return found
+
+
+WITH_PYTHON = _with_python()
 
 
 @pytest.mark.parametrize("page", WITH_PYTHON, ids=lambda page: str(page.relative_to(ROOT / "docs")))
@@ -53,12 +60,10 @@ def test_every_page_of_the_api_has_an_example() -> None:
 
 @pytest.mark.parametrize("package", ["ident", "daq", "drivers"])
 def test_every_exported_name_is_on_one_page(package: str) -> None:
-    described = [
-        name
-        for page, (owner, _) in API_PAGES.items()
-        if owner == package
-        for name in api_names(page)
-    ]
+    described: list[str] = []
+    for page, (owner, _) in API_PAGES.items():
+        if owner == package:
+            described.extend(api_names(page))
     exported = {f"{package}.{name}" for name in __import__(package).__all__}
     again = {"daq.Calibration"}  # it is `ident.Calibration`
     assert len(described) == len(set(described))

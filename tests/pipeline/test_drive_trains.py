@@ -18,7 +18,8 @@ ENTRY = st.sampled_from((0.0, 0.0, 0.0, 1.0, -1.0, 32.0, 45.0, -48.0, 101.5))
 def ratios(draw: st.DrawFn) -> list[list[float]]:
     """Square matrices with zeros, also on the diagonal, and negative ratios."""
     n = draw(st.integers(1, 6))
-    return [[draw(ENTRY) for _ in range(n)] for _ in range(n)]
+    row = st.lists(ENTRY, min_size=n, max_size=n)
+    return draw(st.lists(row, min_size=n, max_size=n))
 
 
 @given(ratios())

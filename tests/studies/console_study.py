@@ -27,6 +27,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext, suppress
 from http.client import HTTPConnection, HTTPException
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -129,11 +130,10 @@ def block(
         parts.append(recording(cell, plan, log))
     lasted_s = time.monotonic() - began_s
     jitter = np.concatenate([part.pop("jitter_us") for part in parts])
-    gaps = [gap for part in parts for gap in part.pop("gaps", ())]
-    summed = {
-        key: sum(part[key] for part in parts)
-        for key in ("ended_early", "lost", "missing", "samples")
-    }
+    gaps = list(chain.from_iterable(part.pop("gaps", ()) for part in parts))
+    summed = {}
+    for key in ("ended_early", "lost", "missing", "samples"):
+        summed[key] = sum(part[key] for part in parts)
     found = {
         "open": process is not None,
         "recordings": len(parts),

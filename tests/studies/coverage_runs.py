@@ -186,7 +186,7 @@ def make_coverage(
     Raises:
         TaskFailed: planning or simulating failed.
     """
-    plans = dict.fromkeys(plan for task in tasks for plan in task.plans)
+    plans = dict.fromkeys(chain.from_iterable(task.plans for task in tasks))
     for line in chain(
         side_by_side(make_plan, plans, processes), side_by_side(make_runs, tasks, processes)
     ):

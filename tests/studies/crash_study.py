@@ -206,13 +206,10 @@ def _as_sent(samples: SampleBlock, answers: list[tuple[int, bytes]]) -> bool:
     with the numbers that the cell put on the bus.
     """
     axes = samples.position_counts.shape[1]
-    sent = np.array(
-        [
-            [FEEDBACK.unpack(data) for node, data in answers if node == axis + 1]
-            for axis in range(axes)
-        ],
-        dtype=np.int64,
-    )
+    by_axis: list[list[tuple[int, ...]]] = []
+    for axis in range(axes):
+        by_axis.append([FEEDBACK.unpack(data) for node, data in answers if node == axis + 1])
+    sent = np.array(by_axis, dtype=np.int64)
     length = len(samples.cycle)
     logged: tuple[NDArray[np.integer], ...] = (
         samples.position_counts,

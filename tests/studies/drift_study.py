@@ -210,10 +210,8 @@ def main(arguments: list[str] | None = None) -> int:
     for before in (1, 2, 4, 8, 12, 24):
         for std_percent in (0.2, 0.3, 0.5, 0.8, 1.0):
             delay = delays(rng, options.histories // 5, std_percent=std_percent, before=before)
-            cusum, of_any = (
-                ", ".join(f"{share_percent(late, within):.0f}" for within in (0, 2, 4))
-                for late in (delay.cusum, delay.any)
-            )
+            cusum = ", ".join(f"{share_percent(delay.cusum, within):.0f}" for within in (0, 2, 4))
+            of_any = ", ".join(f"{share_percent(delay.any, within):.0f}" for within in (0, 2, 4))
             middle, most = (
                 int(np.quantile(delay.any, share, method="higher")) for share in (0.5, 0.95)
             )

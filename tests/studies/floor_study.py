@@ -19,6 +19,7 @@ import tempfile
 from collections.abc import Sequence
 from contextlib import redirect_stdout
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -156,7 +157,7 @@ def main(arguments: list[str] | None = None) -> int:
             for line in scores[-1].lines:
                 print_line(line)
         for source in FloorSource:
-            ratios = np.array([ratio for score in scores for ratio in score.least[source]])
+            ratios = np.array(list(chain.from_iterable(score.least[source] for score in scores)))
             if len(ratios):
                 print_line(
                     f"{world}, {source.value}: {np.sum(ratios > 1.0)} of {len(ratios)} lower "

@@ -72,7 +72,7 @@ def score(logs: StudyLogs, model: Model, conditioning: Conditioning) -> dict[str
     """
     runs = [load_run(path)[0] for path in logs.fit]
     system = _system(model, runs, conditioning, instruments=True)
-    bare = [run for run in (load_run(path)[0] for path in logs.fit) if run.payload is None]
+    bare = [run for run in runs if run.payload is None]
     weighing = [
         _system(model, [*bare, load_run(path)[0]], conditioning) for path in logs.second_payload
     ]

@@ -19,6 +19,7 @@ import sys
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -157,7 +158,7 @@ def main(arguments: list[str] | None = None) -> int:
         tasks = tasks_of(options.cells, world, out=options.out, duration_s=options.duration)
         mine = options.shard.of(tasks)
         make_coverage(mine, processes=options.processes, report_line=_print_line)
-        scoring = [_Task(task, method) for method in options.method for task in mine]
+        scoring = [_Task(task, method) for method, task in product(options.method, mine)]
         for line in side_by_side(make_score, scoring, options.processes):
             _print_line(line)
         for method in options.method:

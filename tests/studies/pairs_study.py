@@ -310,11 +310,9 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--tables", type=Path, help="folder for the table as CSV")
     options = parser.parse_args(arguments)
     # Worlds in turn, so that an interrupted study has as many recordings of each.
-    tasks = [
-        RecordingTask(options.out, world, number)
-        for number in range(options.recordings)
-        for world in options.world
-    ]
+    tasks = []
+    for number in range(options.recordings):
+        tasks += [RecordingTask(options.out, world, number) for world in options.world]
     for line in make_scores(options.shard.of(tasks), options.minutes):
         print_line(line)
     axes = load_cell(CELL).axis_names

@@ -227,7 +227,9 @@ def merit_table(merits: dict[int, dict[str, Merit]]) -> PaperTable:
         means = (
             np.mean(gains),
             np.max(gains),
-            *(np.mean([getattr(m, n) for m in of]) for n in ("error", "disc", "plate")),
+            np.mean([merit.error for merit in of]),
+            np.mean([merit.disc for merit in of]),
+            np.mean([merit.plate for merit in of]),
         )
         rows.append((case, *(percent(float(value)) for value in means)))
     seeds = ", ".join(map(str, merits))

@@ -22,6 +22,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from enum import Enum
+from itertools import product
 from pathlib import Path
 
 from daq.config.cell import Cell
@@ -150,8 +151,8 @@ def record_study(
         TaskFailed: planning or recording failed; what was finished before is kept.
     """
     letters = sorted({run.plan for run in RUNS})
-    plans = [_PlanTask(out, seed, letter, duration_s) for seed in seeds for letter in letters]
-    runs = [_RunTask(out, seed, floor, run) for floor in floors for seed in seeds for run in RUNS]
+    plans = [_PlanTask(out, seed, letter, duration_s) for seed, letter in product(seeds, letters)]
+    runs = [_RunTask(out, seed, floor, run) for floor, seed, run in product(floors, seeds, RUNS)]
     for floor in floors:
         for seed in seeds:
             cell = study_cell(seed, FLOORS[floor])
@@ -185,15 +186,14 @@ def study_logs(
         FileNotFoundError: one of them has not been recorded.
         ValueError: it was recorded with another noise than its floor has now.
     """
-    return tuple(_logs(out, floor, seed) for floor in floors for seed in seeds)
+    return tuple(_logs(out, floor, seed) for floor, seed in product(floors, seeds))
 
 
 def _logs(out: Path, floor: str, seed: int) -> StudyLogs:
     folder = _folder(out, floor, seed)
-    fit, validation, second = (
-        tuple(folder / f"{run.name}.mcap" for run in runs)
-        for runs in (FIT, VALIDATION, SECOND_PAYLOAD)
-    )
+    fit = tuple(folder / f"{run.name}.mcap" for run in FIT)
+    validation = tuple(folder / f"{run.name}.mcap" for run in VALIDATION)
+    second = tuple(folder / f"{run.name}.mcap" for run in SECOND_PAYLOAD)
     missing = [str(path) for path in (*fit, *validation, *second) if not path.is_file()]
     if missing:
         raise FileNotFoundError(

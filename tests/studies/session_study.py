@@ -289,9 +289,10 @@ def main(arguments: list[str] | None = None) -> int:
     )
     options = parser.parse_args(arguments)
     source = digest_of_source("tests.studies.session_study")
-    units = [
-        (robot, seed) for seed in options.seeds for robot in ROBOTS if robot.name in options.only
-    ]
+    wanted = [robot for robot in ROBOTS if robot.name in options.only]
+    units = []
+    for seed in options.seeds:
+        units += [(robot, seed) for robot in wanted]
 
     def fingerprint(robot: StudiedRobot, seed: int) -> str:
         return digest(source, robot.fingerprint, seed)

@@ -163,11 +163,12 @@ def summary(units: Sequence[dict[str, Any]]) -> str:
 
 def _z(units: Sequence[dict[str, Any]]) -> list[float]:
     """Errors of all gains over their σ."""
-    return [
-        error / unit["guided"]["std_percent"][axis]
-        for unit in units
-        for axis, error in unit["guided"].get("error_percent", {}).items()
-    ]
+    found = []
+    for unit in units:
+        guided = unit["guided"]
+        for axis, error in guided.get("error_percent", {}).items():
+            found.append(error / guided["std_percent"][axis])
+    return found
 
 
 def _rms(values: Sequence[float]) -> float:

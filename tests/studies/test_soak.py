@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import chain, product
 from pathlib import Path
 
 import numpy as np
@@ -47,7 +48,7 @@ class Scene:
 
     def judged(self) -> Verdict:
         """The verdict on it."""
-        frames = [frame for cycle in self.bus for frame in cycle]
+        frames = list(chain.from_iterable(self.bus))
         return judge_losses(self.log, frames, self.ticks, PERIOD_NS, NODES, in_order=self.by_clock)
 
     def mark_missing(self, cycle: int, axis: int) -> None:
@@ -86,10 +87,9 @@ def scene() -> Scene:
     log, bus = made()
     begin_ns = bus[0][0].time_ns - 10 * PERIOD_NS
     end_ns = bus[-1][0].time_ns + 10 * PERIOD_NS
+    times_ns = range(begin_ns, end_ns, TICK_NS)
     ticks = [
-        Tick(at_ns, TICK_NS, 0, WORK_NS, 0, 0, 0, cpu)
-        for cpu in range(2)
-        for at_ns in range(begin_ns, end_ns, TICK_NS)
+        Tick(at_ns, TICK_NS, 0, WORK_NS, 0, 0, 0, cpu) for cpu, at_ns in product(range(2), times_ns)
     ]
     return Scene(replace(log, valid=False), bus, ticks)
 
@@ -267,7 +267,7 @@ def test_a_planted_loss_has_its_cause(
 
 
 def test_each_kind_of_loss_is_planted() -> None:
-    planted = {kind for _, _, _, kinds in PLANTED for kind in kinds}
+    planted = set(chain.from_iterable(kinds for _, _, _, kinds in PLANTED))
     assert planted == set(LossKind)
 
 

@@ -5,6 +5,7 @@ blind cells are what they say.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import chain
 from math import radians
 from pathlib import Path
 from types import SimpleNamespace
@@ -65,7 +66,7 @@ from tests.studies.warm_up_study import (
 @given(count=st.integers(1, 9), tasks=st.integers(0, 40))
 def test_the_shards_of_a_study_have_every_task_once(count: int, tasks: int) -> None:
     shards = [Shard(number, count).of(range(tasks)) for number in range(1, count + 1)]
-    sorted_tasks = sorted(task for part in shards for task in part)
+    sorted_tasks = sorted(chain.from_iterable(shards))
     assert sorted_tasks == list(range(tasks))
     smallest = min(map(len, shards))
     largest_difference = max(map(len, shards)) - smallest
@@ -213,8 +214,10 @@ def test_a_cell_follows_a_demand_without_any_rest() -> None:
 def test_cells_of_one_seed_have_one_truth_in_every_world() -> None:
     cells = [world_cell(7, world).bare for world in WORLDS]
     assert len({cell.urdf for cell in cells}) == 1
-    gain_nm_per_a = {tuple(axis.gain_nm_per_a for axis in cell.axes) for cell in cells}
-    assert len(gain_nm_per_a) == 1
+    gains_of_cells = set()
+    for cell in cells:
+        gains_of_cells.add(tuple(axis.gain_nm_per_a for axis in cell.axes))
+    assert len(gains_of_cells) == 1
     for cell, world in zip(cells, WORLDS.values(), strict=True):
         torque_disturbance_percent = {axis.torque_disturbance_percent for axis in cell.axes}
         assert torque_disturbance_percent == {world.disturbance_percent}
@@ -401,7 +404,7 @@ def test_a_split_by_region_leaves_each_sample_on_one_side() -> None:
     runs = [_circling_run("a", 6), _circling_run("b", 6)]
     parts = split_by_region(runs, 0.5, seed=2)
     expected = set(range(PARTS))
-    assert {int(one) for part in parts for one in part} == expected
+    assert set(map(int, chain.from_iterable(parts))) == expected
     left_out = [part == 1 for part in parts]
     model = model_of(load_cell(CELL))
     rest, unseen = two_sides(runs, left_out, model, ROWS)
@@ -497,7 +500,7 @@ def _evidence_of(
     """What `judge_mistake` reads of an evidence:
     two fixed gains, and the coefficients of effects.
     """
-    unknowns = tuple(column for placed in effects for column in placed.columns)
+    unknowns = tuple(chain.from_iterable(placed.columns for placed in effects))
     covariance = np.diag([0.0, 0.0, *np.square(std)])
     parameters = np.array(values)
     gains = np.ones(2)

@@ -179,10 +179,9 @@ def main(arguments: list[str] | None = None) -> int:
     bent = found[CLEAN_CELLS:-CROWDED_CELLS]
     text = table(clean, bent, found[-CROWDED_CELLS:])
     print_line(text)
-    means = {
-        name: float(np.mean([cell.gain_errors_percent[name] for cell in clean]))
-        for name in ESTIMATORS
-    }
+    means = {}
+    for name in ESTIMATORS:
+        means[name] = float(np.mean([cell.gain_errors_percent[name] for cell in clean]))
     line = f"clean cells: tls / ml = {means['tls'] / means['ml']:.2f}"
     print_line(line)
     for name in ("ml", "tls"):

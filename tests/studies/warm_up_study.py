@@ -228,14 +228,10 @@ def summary(rows: Sequence[Row]) -> str:
     for order in ORDERS:
         for friction in FRICTIONS:
             own = [row for row in rows if (row.order, row.friction) == (order, friction)]
-            by_constant = (
-                [row for row in own if row.time_constant_min == one] for one in constants_min
-            )
-            lines += [
-                _line(f"{of_one[0].time_constant_min:g}", of_one)
-                for of_one in by_constant
-                if of_one
-            ]
+            for constant_min in constants_min:
+                of_one = [row for row in own if row.time_constant_min == constant_min]
+                if of_one:
+                    lines.append(_line(f"{of_one[0].time_constant_min:g}", of_one))
             if own:
                 lines.append(_line("all", own))
     return "\n".join(lines)

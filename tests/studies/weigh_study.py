@@ -56,7 +56,8 @@ def table(cells: list[dict[str, Any]]) -> str:
     """Root mean square error, z and coverage of the 95 % intervals of each way and quantity."""
     lines = ["| way | quantity | rms error | rms z | inside 1.96 σ |", "|---|---|---|---|---|"]
     for way in WAYS:
-        error, std = (np.array([cell[way][key] for cell in cells]) for key in ("error", "std"))
+        error = np.array([cell[way]["error"] for cell in cells])
+        std = np.array([cell[way]["std"] for cell in cells])
         mass_kg = [cell[way]["mass_kg"] for cell in cells]
         mass = np.array(mass_kg)
         shown: FloatArray = np.column_stack((100.0 * error[:, :1] / mass, 1000.0 * error[:, 1:]))

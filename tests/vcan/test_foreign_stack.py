@@ -13,7 +13,7 @@ import subprocess
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 
 import numpy as np
@@ -119,9 +119,8 @@ def test_they_are_mapped_started_streamed_from_and_given_back(
     # would show.
     assert (np.diff(positions, axis=0) == STEP).all()
     assert {sample.current_raw for sample in samples} == {(-11, -12)}
-    assert {decode(word) for sample in samples for word in sample.statusword} == {
-        State.SWITCH_ON_DISABLED
-    }
+    words = chain.from_iterable(sample.statusword for sample in samples)
+    assert {decode(word) for word in words} == {State.SWITCH_ON_DISABLED}
     figure(
         f"foreign stack: {CYCLES} cycles of {len(NODES)} drives in {seconds:.2f} s, "
         f"{statistics.frames} answers, 0 lost"

@@ -240,12 +240,10 @@ def test_a_command_that_is_broken_into_lines_is_the_same_to_a_shell(width: int) 
 def test_the_table_of_exit_codes_is_that_of_the_code(checkout: Path) -> None:
     page = (checkout / "docs/reference/exit-codes.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| ([\d to]+) \|", page, re.MULTILINE)
-    named = [
-        code
-        for row in rows
-        for first, _, last in [row.partition(" to ")]
-        for code in _span(first, last)
-    ]
+    named: list[int] = []
+    for row in rows:
+        first, _, last = row.partition(" to ")
+        named.extend(_span(first, last))
     sorted_codes = sorted(code.value for code in ExitCode)
     assert sorted(named) == sorted_codes
     for code in ExitCode:

@@ -81,10 +81,9 @@ def test_no_verb_that_asks_the_drives_advises_to_run_itself(
 
 
 def test_advice_names_verbs_that_exist(capsys: pytest.CaptureFixture[str]) -> None:
-    advice = [
-        *ADVICE.values(),
-        *(one for within in ADVICE_WITHIN.values() for one in within.values()),
-    ]
+    advice = list(ADVICE.values())
+    for within in ADVICE_WITHIN.values():
+        advice.extend(within.values())
     for expected, remedy in advice:
         matches = re.findall(r"`drivegain ([a-z-]+)([^`]*)`", f"{expected} {remedy}")
         for verb, rest in matches:

@@ -602,4 +602,6 @@ def test_each_reading_publishes_the_load_of_the_buses(
     for _ in range(2):
         watch.read(1.1)
     assert [list(load) for load in loads] == [[one.name for one in CELL.buses]] * 2
-    assert all(0.0 < load < 0.06 for one in loads for load in one.values())
+    for load_of_bus in loads:
+        for load in load_of_bus.values():
+            assert 0.0 < load < 0.06

@@ -123,7 +123,9 @@ OF_LONG_NAMES = {
     "logs of a fleet": ["fleet", LONG_NAME, "--out", "made"],
     "a controller": ["apply", VALID["cell"], "calibration.yaml", "--to", LONG_NAME],
     "a rollback": ["rollback", VALID["cell"], "--to", LONG_NAME],
-} | {line: [word.replace("PIPE", LONG_NAME) for word in words] for line, words in LINES.items()}
+}
+for _line, _words in LINES.items():
+    OF_LONG_NAMES[_line] = [word.replace("PIPE", LONG_NAME) for word in _words]
 
 
 @pytest.mark.parametrize("line", OF_LONG_NAMES)

@@ -9,6 +9,7 @@ import io
 import warnings
 from dataclasses import replace
 from datetime import UTC, datetime
+from itertools import chain
 from pathlib import Path
 
 import pytest
@@ -71,7 +72,7 @@ def test_the_table_of_a_fleet_has_no_formula_and_can_be_written(text: str) -> No
     assert made.startswith(",".join(FIRST_COLUMNS))
     string_io = io.StringIO(made, newline="")
     header, *lines = csv.reader(string_io)
-    for cell in [*header, *(cell for line in lines for cell in line)]:
+    for cell in chain(header, *lines):
         assert not cell.startswith(tuple("=+@\t\r\n"))
     assert len(lines) == 2
     column = inert(f"{text} gain")

@@ -61,7 +61,8 @@ def _digits(value: int, width: int) -> list[int]:
 def _bits_on_the_wire(identifier: int, data: bytes) -> int:
     """Length of a data frame, its real stuff bits and the space after it counted."""
     head = [0, *_digits(identifier, 11), 0, 0, 0, *_digits(len(data), 4)]
-    head += [bit for byte in data for bit in _digits(byte, 8)]
+    for byte in data:
+        head += _digits(byte, 8)
     head += _digits(_crc(head), 15)
     stuffed = 0
     run = 0

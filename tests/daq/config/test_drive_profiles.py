@@ -7,6 +7,7 @@ from __future__ import annotations
 import contextlib
 import json
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -272,9 +273,13 @@ def test_a_profile_may_name_the_data_sheet_beside_it_and_no_other_place() -> Non
 # ------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("name", "file"), [(name, file) for name, files in SHEETS.items() for file in files]
-)
+def _sheets() -> Iterator[tuple[str, str]]:
+    for name, files in SHEETS.items():
+        for file in files:
+            yield name, file
+
+
+@pytest.mark.parametrize(("name", "file"), list(_sheets()))
 def test_a_profile_agrees_with_the_makers_data_sheet(
     name: str, file: str, shared_data: Path
 ) -> None:

@@ -33,9 +33,9 @@ from daq.workflow.weigh import weigh_logs
 from ident.calibration import Calibration, Source
 from ident.data.conditioning import Conditioning
 from tests.daq.calibrations import demo_calibration
-from tests.daq.logs import DISC, demo_content, samples, write
+from tests.daq.logs import DISC, demo_content, rising_counts, samples, write
 
-ROWS = samples([[100 * k + axis for axis in range(6)] for k in range(60)])
+ROWS = samples(rising_counts(60, 6))
 
 
 @pytest.fixture

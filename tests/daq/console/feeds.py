@@ -49,11 +49,10 @@ def predicting_calibration() -> Calibration:
     filters = Conditioning(standstill_rad_s=standstill_rad_s).document()
     # Without dry friction, whose sign depends on the last digit of a speed near zero.
     each = {"Ia": 1.0, "fv": 3.0, "off": 0.5}
-    parameters = tuple(
-        Parameter(f"{name}{axis}", value / axis, 0.1, "SI")
-        for name, value in each.items()
-        for axis in range(1, 7)
-    )
+    parameters: list[Parameter] = []
+    for name, value in each.items():
+        of_axes = [Parameter(f"{name}{axis}", value / axis, 0.1, "SI") for axis in range(1, 7)]
+        parameters.extend(of_axes)
     parameter = Parameter("my3", -1.0, 0.1, "kg m")
     gravity = Parameter("mx2", 2.0, 0.1, "kg m"), parameter
     left = (0.01,) * 6  # of currents of some tenths of an ampere

@@ -194,10 +194,8 @@ def test_a_timer_over_many_weeks(tmp_path: Path, made: Made) -> None:
     assert fitted is not None
     assert history_of(rig.cell_file).in_force() == fitted.calibration_sha256
     assert len(rig.backups) == 2
-    begun, ended = (
-        [entry for entry in rig.audit if entry.action is action]
-        for action in (AuditAction.RECALIBRATION_BEGUN, AuditAction.RECALIBRATION_ENDED)
-    )
+    begun = [entry for entry in rig.audit if entry.action is AuditAction.RECALIBRATION_BEGUN]
+    ended = [entry for entry in rig.audit if entry.action is AuditAction.RECALIBRATION_ENDED]
     assert len(begun) == len(ended) == len(outcomes)
 
 

@@ -16,7 +16,7 @@ import socket
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -450,15 +450,19 @@ def test_an_object_store_is_read_in_the_workers_and_leaves_nothing_behind(
         store.rm("/hall", recursive=True)
 
 
+def _facts(logs: Sequence[StoredLog]) -> list[tuple[str, str | None, int]]:
+    seen_logs = [log for log in survey(logs) if isinstance(log, SeenLog)]
+    return [(log.cell, log.mounting, log.started_ns) for log in seen_logs]
+
+
 def test_a_folder_by_its_address_is_that_folder(few: Path) -> None:
     by_path = list_logs(str(few))
     by_address = list_logs(f"file://{few}")
     expected = [log.name for log in by_address]
     assert [log.name for log in by_path] == expected
-    reported = [[(log.cell, log.mounting, log.started_ns) for log in survey(logs) if isinstance(log, SeenLog)]  # noqa: E501
-            for logs in (by_path, by_address)]  # fmt: skip
-    assert reported[0] == reported[1]
-    assert len(reported[0]) == 7
+    found_by_path = _facts(by_path)
+    assert found_by_path == _facts(by_address)
+    assert len(found_by_path) == 7
 
 
 @pytest.mark.parametrize("address", ["{}", "file://{}", "local://{}"])
@@ -756,9 +760,10 @@ def _seen_logs() -> st.SearchStrategy[list[SeenLog]]:
 @given(_seen_logs(), st.randoms(use_true_random=False))
 def test_every_log_has_one_role_in_one_cell(logs: list[SeenLog], random: Any) -> None:
     cells = by_cell(logs)
-    assert sorted(seen.log.name for cell in cells for seen in (*cell.fit, *cell.holdout)) == sorted(
-        seen.log.name for seen in logs
-    )
+    used: list[str] = []
+    for cell in cells:
+        used.extend(seen.log.name for seen in (*cell.fit, *cell.holdout))
+    assert sorted(used) == sorted(seen.log.name for seen in logs)
     assert len({(cell.cell, cell.configuration_sha256) for cell in cells}) == len(cells)
     for cell in cells:
         expected = {(cell.cell, cell.configuration_sha256)}

@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
 from functools import partial
 from html import escape
-from itertools import count
+from itertools import chain, count
 from pathlib import Path
 from typing import Any
 
@@ -767,18 +767,16 @@ def test_later_blocks_stay_where_the_accepted_ones_were(
         load_plan(rig.session.folder / f"plan-{number}.yaml", rig.cell)
         for number in (1, 2, 3, 4, 5)
     ]
-    accepted = [move for one in plans[:3] for move in one.moves]
+    accepted = list(chain.from_iterable(one.moves for one in plans[:3]))
     target_rad = [move.target_rad for move in accepted]
-    smallest_target_rad = np.min(target_rad, axis=0)
-    lower = smallest_target_rad - 2e-5
-    largest_target_rad = np.max([move.target_rad for move in accepted], axis=0)
-    upper = largest_target_rad + 2e-5
-    for move in (move for one in plans[3:] for move in one.moves):
+    lower = np.min(target_rad, axis=0) - 2e-5
+    upper = np.max(target_rad, axis=0) + 2e-5
+    largest_velocity = max(move.velocity for move in accepted)
+    largest_acceleration = max(move.acceleration for move in accepted)
+    for move in chain.from_iterable(one.moves for one in plans[3:]):
         assert (np.array(move.target_rad) >= lower).all()
         assert (np.array(move.target_rad) <= upper).all()
-        largest_velocity = max(other.velocity for other in accepted)
         assert move.velocity <= largest_velocity
-        largest_acceleration = max(other.acceleration for other in accepted)
         assert move.acceleration <= largest_acceleration
 
 

@@ -435,19 +435,17 @@ def test_the_scatter_of_axes_is_reported_together_where_the_same_recordings_know
     rng = np.random.default_rng(12)
     names = tuple(f"J{number}" for number in range(1, 4))
     values = rng.normal(10.0, 0.3, (9, 3))
-    entries = [
-        replace(
-            _entry(str(week)),
-            logs=str(week),
-            recorded=BEGIN + timedelta(weeks=week),
-            # J3 was held fixed once.
-            gains=tuple(
-                Gain(axis, float(value), 0.0 if (axis, week) == ("J3", 4) else 0.1, "Nm/A", 10.0)
-                for axis, value in zip(names, row, strict=True)
-            ),
-        )
-        for week, row in enumerate(values)
-    ]
+    stds_nm_per_a = np.full(values.shape, 0.1)
+    stds_nm_per_a[4, 2] = 0.0  # J3 was held fixed once.
+    entries = []
+    for week, row in enumerate(values):
+        gains = [
+            Gain(axis, float(value), float(std), "Nm/A", 10.0)
+            for axis, value, std in zip(names, row, stds_nm_per_a[week], strict=True)
+        ]
+        entry = _entry(str(week))
+        recorded = BEGIN + timedelta(weeks=week)
+        entries.append(replace(entry, logs=str(week), recorded=recorded, gains=tuple(gains)))
     found = dispersions_of(entries, names)
     assert tuple(found) == names
     expected = dispersions(values[:, :2].T, np.full((2, 9), 0.1))

@@ -47,7 +47,9 @@ ROWS = 200
 POSITION = 0.35 * np.sin(np.arange(ROWS)[:, None] / 9.0 + np.arange(6))
 EFFORT = np.cos(np.arange(ROWS)[:, None] / 7.0 + np.arange(6))
 TIME = TimeColumn(file="run.mcap", column=STAMP, unit=TimeUnit.NANOSECOND)
-COLUMNS = tuple(f"{field}.{joint}" for field in ("position", "effort") for joint in JOINTS)
+POSITION_COLUMNS = tuple(f"position.{joint}" for joint in JOINTS)
+EFFORT_COLUMNS = tuple(f"effort.{joint}" for joint in JOINTS)
+COLUMNS = POSITION_COLUMNS + EFFORT_COLUMNS
 
 
 def message(row: int, joints: Sequence[int] = range(6), **changes: Any) -> dict[str, Any]:

@@ -10,6 +10,7 @@ import sqlite3
 import time
 from collections.abc import Callable
 from contextlib import closing, nullcontext
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -63,13 +64,9 @@ def record(folder: Path, storage: StoragePlugin, packed: CompressionMode, rows: 
     return folder
 
 
-KINDS = [
-    (storage, packed)
-    for storage in StoragePlugin
-    for packed in CompressionMode
-    # There is no such kind
-    if (storage, packed) != (StoragePlugin.SQLITE3, CompressionMode.STORAGE)
-]
+KINDS = list(product(StoragePlugin, CompressionMode))
+# There is no such kind
+KINDS.remove((StoragePlugin.SQLITE3, CompressionMode.STORAGE))
 
 
 @pytest.mark.parametrize(("storage", "packed"), KINDS, ids=lambda value: value.name.lower())

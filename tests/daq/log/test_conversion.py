@@ -237,10 +237,8 @@ def test_a_wrap_in_a_log_is_no_turn_of_the_joint(record: Recorder) -> None:
     changed_axis = replace(CELL.axes[0], zero_offset_rad=-end_rad)
     axes = (changed_axis, *CELL.axes[1:])
     counts = [2**31 - 3 + k - (2**32 if k >= 3 else 0) for k in range(6)]
-    rows = [
-        replace(row, current_raw=(0,) * 6)
-        for row in samples([[count, 0, 0, 0, 0, 0] for count in counts])
-    ]
+    position_counts = [[count, 0, 0, 0, 0, 0] for count in counts]
+    rows = [replace(row, current_raw=(0,) * 6) for row in samples(position_counts)]
     run, _ = load_run(record(rows), replace(CELL, axes=axes))
     expected = np.arange(-3, 3) * 2 * pi / 65536 / 32
     np.testing.assert_allclose(run.position_rad[:, 0], expected, atol=1e-9)

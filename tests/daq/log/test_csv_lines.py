@@ -34,7 +34,7 @@ COUNT = 12
 VALUES = np.column_stack(
     (0.01 * np.arange(COUNT), np.sin(np.arange(COUNT)), np.cos(np.arange(COUNT)))
 )
-ROWS = [",".join(f"{value:.6f}" for value in row) for row in VALUES.tolist()]
+ROWS = ["{:.6f},{:.6f},{:.6f}".format(*row) for row in VALUES.tolist()]
 READ = np.round(VALUES, 6)[:, 1:]
 
 

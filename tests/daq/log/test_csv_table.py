@@ -25,7 +25,7 @@ from daq.log.csv_table import read_csv
 from daq.log.table import Table
 
 ROWS = ("0.125,1.50", "0.250,1.25", "0.375,1.00", "0.500,0.75")
-VALUES = np.array([[float(field) for field in row.split(",")] for row in ROWS])
+VALUES = np.array([row.split(",") for row in ROWS], dtype=float)
 
 
 def _read(

@@ -171,7 +171,8 @@ def test_the_start_and_the_end_come_back(tmp_path: Path, axes: int) -> None:
 
 @pytest.mark.parametrize("axes", [1, 2, 5, 6])
 def test_another_reader_decodes_the_same(tmp_path: Path, axes: int) -> None:
-    rows = samples([[k * (i + 1) for i in range(axes)] for k in range(45)], missing=1)
+    position_counts = np.outer(np.arange(45), np.arange(1, axes + 1))
+    rows = samples(position_counts.tolist(), missing=1)
     event = CellEvent(START_NS, 0, EventKind.EMCY, 0x8130, "Lebenszeichen fehlt: Ä")
     a_path = tmp_path / "a.mcap"
     path = write(a_path, content(axes), rows, [event])

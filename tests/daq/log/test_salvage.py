@@ -45,9 +45,9 @@ from daq.writeback.gates.table import check_gates
 from daq.writeback.request import Edit, Request
 from drivers.messages import CellEvent, EventKind, Quantity, SlowReading
 from tests.daq.calibrations import demo_calibration
-from tests.daq.logs import DISC, START_NS, demo_content, joints, samples, write
+from tests.daq.logs import DISC, START_NS, demo_content, joints, rising_counts, samples, write
 
-ROWS = samples([[100 * k + axis for axis in range(6)] for k in range(700)])
+ROWS = samples(rising_counts(700, 6))
 MOVES = [
     CellEvent(START_NS + 50_000_000 * k, None, EventKind.MOVE_START, k, f"move {k}")
     for k in range(3)

@@ -16,7 +16,7 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
 from drivers.messages import CellEvent, EventKind
-from tests.daq.logs import START_NS, demo_content, samples, write
+from tests.daq.logs import START_NS, demo_content, rising_counts, samples, write
 
 VIEWERS = Path(__file__).parents[3] / "configs" / "viewers"
 AXES = 6
@@ -27,7 +27,7 @@ ROWS = 60
 def decoded(tmp_path_factory: pytest.TempPathFactory, checkout: Path) -> dict[str, list[Any]]:
     """Messages of a log by topic."""
     event = CellEvent(START_NS, 2, EventKind.EMCY, 0x8611, "node 3: following error")
-    rows = samples([[100 * row + axis for axis in range(AXES)] for row in range(ROWS)])
+    rows = samples(rising_counts(ROWS, AXES))
     path = tmp_path_factory.mktemp("log") / "bare.mcap"
     log = write(path, demo_content(checkout), rows, [event])
     messages: dict[str, list[Any]] = defaultdict(list)
@@ -48,7 +48,7 @@ def test_the_messages_are_those_that_were_written(decoded: dict[str, list[Any]])
     }
     assert set(decoded) == expected
     position_counts = [list(message.position_counts) for message in decoded["/cell/samples"]]
-    assert position_counts == [[100 * row + axis for axis in range(AXES)] for row in range(ROWS)]
+    assert position_counts == rising_counts(ROWS, AXES)
     first = decoded["/cell/samples"][0]
     assert first.stamp.sec * 10**9 + first.stamp.nanosec == START_NS
     (event,) = decoded["/cell/events"]

@@ -13,6 +13,7 @@ from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from html.parser import HTMLParser
 from io import StringIO
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -477,7 +478,7 @@ def test_the_document_is_complete_and_described(closed: Closed, checkout: Path) 
         floors,
         first_motor,
     )
-    for key in {key for part in named for key in part}:
+    for key in set(chain.from_iterable(named)):
         assert f"`{key}`" in described, key
     position_cutoff_hz = document["filter"]["position_cutoff_hz"]
     assert position_cutoff_hz == closed.fitted.cell.conditioning.position_cutoff_hz

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import re
 import sys
+from itertools import chain
 
 import pytest
 from hypothesis import given
@@ -63,7 +64,8 @@ def test_every_number_is_whole_at_any_width(rows: list[list[str]], width: int) -
         table.add_row(*row)
     text = _shown([table], width)
     assert "…" not in text
-    assert all(_digits(value)[0] in text for row in rows for value in row)
+    for value in chain.from_iterable(rows):
+        assert _digits(value)[0] in text
 
 
 WORDS = st.text(
@@ -89,9 +91,8 @@ def test_no_word_of_a_table_is_broken_or_cut_whatever_columns_wrap(
         table.add_row(*row)
     shown = _on_terminal([table], width)
     words = shown.split()
-    assert [
-        word for row in rows for value in row for word in value.split() if word not in words
-    ] == []
+    for value in chain.from_iterable(rows):
+        assert set(value.split()) <= set(words)
 
 
 @given(

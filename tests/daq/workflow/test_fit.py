@@ -85,10 +85,14 @@ def test_logs_become_sources_with_their_roles(
     found = fit(logs, holdout=_paths("run3"))
     expected = [("run0", "fit"), ("run1", "fit"), ("run2", "fit"), ("run3", "holdout")]
     assert [(source.name, source.role) for source in found.sources] == expected  # fmt: skip
-    assert [(source.payload, source.mounting) for source in found.sources] == [
-        (None, None) if run.payload is None else (run.payload.name, run.payload.mounting)
-        for run in (shelf.runs[source.name] for source in found.sources)
-    ]
+    for source in found.sources:
+        payload = shelf.runs[source.name].payload
+        if payload is None:
+            assert source.payload is None
+            assert source.mounting is None
+        else:
+            assert source.payload == payload.name
+            assert source.mounting == payload.mounting
     assert any(source.mounting for source in found.sources)
     assert found.identification.holdout_error is not None
 

@@ -128,8 +128,9 @@ def test_moving_an_inertia_keeps_it_a_bodys(half: list[float], centre: list[floa
     known = drawn_parameters(2.0, tuple(centre), about_centre_kg_m2)
     inertia = np.array(
         [
-            [known[name] for name in row]
-            for row in (("Ixx", "Ixy", "Ixz"), ("Ixy", "Iyy", "Iyz"), ("Ixz", "Iyz", "Izz"))
+            [known["Ixx"], known["Ixy"], known["Ixz"]],
+            [known["Ixy"], known["Iyy"], known["Iyz"]],
+            [known["Ixz"], known["Iyz"], known["Izz"]],
         ]
     )
     second = 0.5 * np.trace(inertia) * np.eye(3) - inertia

@@ -63,10 +63,9 @@ def test_rows_are_those_of_the_whole_run(cell: Cell, block: int, *, is_late: boo
     found = []
     for one in blocks:
         found.extend(predictor.take(CYCLES[one], position[one], current[one]))
-    cycle, predicted, residual = (
-        np.concatenate([getattr(part, name) for part in found])
-        for name in ("cycle", "predicted", "residual")
-    )
+    cycle = np.concatenate([part.cycle for part in found])
+    predicted = np.concatenate([part.predicted for part in found])
+    residual = np.concatenate([part.residual for part in found])
     # Each row once, without a gap, until the windows of the last samples are not whole.
     cycle_steps = set(np.diff(cycle))
     assert cycle_steps == {10}

@@ -10,6 +10,7 @@ import os
 from collections.abc import Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import pytest
@@ -143,7 +144,7 @@ def _faults_of_drives(folder: Path) -> list[FaultRow]:
     try:
         frames = [unit for unit in scene.units() if unit.call == "send"]
         chosen = [_last_calls(scene)["rename of record of the write"], *frames[80::40]]
-        return [scene.run(unit, Injection(name)) for unit in chosen for name in (KILL, "EIO")]
+        return [scene.run(unit, Injection(name)) for unit, name in product(chosen, (KILL, "EIO"))]
     finally:
         scene.close()
 

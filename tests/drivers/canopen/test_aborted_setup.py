@@ -114,4 +114,5 @@ def test_an_abort_names_axis_object_and_remedy_and_the_other_axis_is_restored(st
     unused = {("write", 0x1A00, 3), ("write", 0x1601, 2)}
     assert is_ready is (step in NOT_NEEDED | unused)
     assert [bus.nodes[0].value(*key) for key in settings] == before
-    assert all(node.statusword & 0x6F == 0x40 for node in bus.nodes)
+    for node in bus.nodes:
+        assert node.statusword & 0x6F == 0x40

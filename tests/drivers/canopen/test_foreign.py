@@ -23,12 +23,13 @@ pytestmark = pytest.mark.slow  # each drive takes a network of its own
 
 def written(bus: ScriptedBus) -> list[str]:
     """Objects that were written, and NMT commands."""
-    return [
-        f"{frame.arbitration_id:03X} {frame.data.hex(' ')}"
-        for frame in bus.sent
-        if frame.arbitration_id == 0
-        or (0x600 < frame.arbitration_id < 0x680 and frame.data[0] >> 5 == 1)
-    ]
+    found = []
+    for frame in bus.sent:
+        if frame.arbitration_id == 0 or (
+            0x600 < frame.arbitration_id < 0x680 and frame.data[0] >> 5 == 1
+        ):
+            found.append(f"{frame.arbitration_id:03X} {frame.data.hex(' ')}")
+    return found
 
 
 @pytest.mark.parametrize(("file", "profile"), MAKES.items())
@@ -43,7 +44,8 @@ def test_a_drive_of_this_data_sheet_is_set_up_moved_and_restored(
         pacing = LockstepSync(PERIOD_NS, 0.005, clock=bus.clock)
         stream = SyncStream(network, pacing)
         samples = list(execute(network, stream, (MOVE,), permission()))
-        assert not any(sample.missing for sample in samples)
+        for sample in samples:
+            assert not sample.missing
         # A drive that acts in its 6040h callback would have gone to the target of before.
         expected = [(3000, 1), (-2000, 1)]
         assert [(node.position, len(node.setpoint_cycles)) for node in bus.nodes] == expected
@@ -58,11 +60,12 @@ def settings(node: object) -> dict[str, int]:
     for base in (0x1400, 0x1800):
         for number in node.numbers(base):
             keys += [(base + number, sub) for sub in (1, 2)]
-            keys += [
-                (base + 0x200 + number, sub)
-                for sub in range(node.value(base + 0x200 + number, 0) + 1)
-            ]
-    return {f"{index:04X}h:{sub:02X}": node.value(index, sub) for index, sub in keys}
+            subs = range(node.value(base + 0x200 + number, 0) + 1)
+            keys += [(base + 0x200 + number, sub) for sub in subs]
+    found = {}
+    for index, sub in keys:
+        found[f"{index:04X}h:{sub:02X}"] = node.value(index, sub)
+    return found
 
 
 def test_a_fixed_mapping_that_carries_the_same_is_used_as_it_is(shared_data: Path) -> None:
@@ -177,8 +180,10 @@ def test_own_rpdos_are_used_only_if_the_target_comes_first_and_nothing_else(
 ) -> None:
     used = fixed_setpoints(command + PROFILE_RPDOS)
     numbers = [record.number for record in used]
-    assert numbers == ([r.number for r in command + PROFILE_RPDOS] if fits else [])
-    assert all(record.transmission == 1 for record in used)
+    expected = [r.number for r in command + PROFILE_RPDOS] if fits else []
+    assert numbers == expected
+    for record in used:
+        assert record.transmission == 1
 
 
 _ELMO = {"elmo-gold", "generic-cia402", "schunk-pilz-prbt"}

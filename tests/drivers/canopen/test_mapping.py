@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import chain
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -21,12 +23,16 @@ entries = st.builds(
 @given(st.lists(entries, max_size=6))
 def test_everything_is_packed_once_and_fits(objects: list[ObjectEntry]) -> None:
     pdos = pack(objects)
-    assert sorted(map(word, objects)) == sorted(word(entry) for pdo in pdos for entry in pdo)
-    assert all(sum(entry.bits for entry in pdo) <= 64 for pdo in pdos)
+    packed = list(chain.from_iterable(pdos))
+    expected = sorted(map(word, packed))
+    assert sorted(map(word, objects)) == expected
+    for pdo in pdos:
+        assert sum(entry.bits for entry in pdo) <= 64
     # First fit: what opened a later PDO had no room in an earlier one.
     for number, pdo in enumerate(pdos[1:], start=1):
         for earlier in pdos[:number]:
-            assert sum(entry.bits for entry in earlier) + pdo[0].bits > 64
+            bits = pdo[0].bits
+            assert sum(entry.bits for entry in earlier) + bits > 64
 
 
 @given(st.lists(entries, min_size=1, max_size=6, unique_by=word), st.data())
@@ -34,14 +40,15 @@ def test_layout_decodes_what_a_drive_would_send(
     objects: list[ObjectEntry], data: st.DataObject
 ) -> None:
     for pdo in pack(objects):
-        values = [
-            data.draw(
-                st.integers(-(1 << entry.bits - 1), (1 << entry.bits - 1) - 1)
-                if entry.signed
-                else st.integers(0, (1 << entry.bits) - 1)
+        values = []
+        for entry in pdo:
+            values.append(
+                data.draw(
+                    st.integers(-(1 << entry.bits - 1), (1 << entry.bits - 1) - 1)
+                    if entry.signed
+                    else st.integers(0, (1 << entry.bits) - 1)
+                )
             )
-            for entry in pdo
-        ]
         payload = b"".join(
             value.to_bytes(entry.bits // 8, "little", signed=entry.signed)
             for value, entry in zip(values, pdo, strict=True)

@@ -48,8 +48,12 @@ def test_scan_reports_who_is_there_and_changes_nothing() -> None:
         first, second = network.scan(wait_s=0.05)
     expected = Identity(0x29A, 0x40200, 7)
     assert first.identity == expected
-    assert (first.node_id, first.device_name, first.state) == (1, "axis", State.SWITCH_ON_DISABLED)
-    assert (second.node_id, second.identity, second.nmt) == (2, None, NmtState.STOPPED)
+    assert first.node_id == 1
+    assert first.device_name == "axis"
+    assert first.state == State.SWITCH_ON_DISABLED
+    assert second.node_id == 2
+    assert second.identity is None
+    assert second.nmt == NmtState.STOPPED
     for node, objects in zip(bus.nodes, before, strict=True):
         assert {**node.objects, (0x6041, 0): None} == {**objects, (0x6041, 0): None}
     frames = [frame for frame in bus.sent if frame.arbitration_id < 0x580]
@@ -87,11 +91,9 @@ def test_prepare_sets_up_and_leaving_restores_everything() -> None:
         network.prepare()
         node = bus.nodes[0]
         assert node.nmt == NmtState.OPERATIONAL
-        assert (node.value(0x1800, 1), node.value(0x1800, 2), node.value(0x1A00, 0)) == (
-            0x181,
-            1,
-            3,
-        )
+        assert node.value(0x1800, 1) == 0x181
+        assert node.value(0x1800, 2) == 1
+        assert node.value(0x1A00, 0) == 3
         assert [node.value(0x1A00, sub) for sub in (1, 2, 3)] == [
             0x60640020,
             0x60740010,
@@ -104,7 +106,8 @@ def test_prepare_sets_up_and_leaving_restores_everything() -> None:
         assert isinstance(report, dict)
         assert report["serial"] == 7
         assert report["scale_objects"] == {"6075h:00": 2000}
-        assert (report["amplitude"], report["tap"]) == ("rms", "reference")
+        assert report["amplitude"] == "rms"
+        assert report["tap"] == "reference"
         assert report["mapping"][0] == "TPDO1: COB-ID 00000181h, type 1, 60640020 60740010 60410010"
     changed = ((0x6040, 0), (0x6041, 0))
     for node, objects in zip(bus.nodes, before, strict=True):
@@ -279,12 +282,15 @@ def test_a_setting_that_a_drive_refuses_is_named_and_the_others_are_restored(
         before.append([node.value(*key) for key in settings])
     with pytest.raises(SetupRefused) as refused, network:
         network.prepare()
+    after = []
+    for node in bus.nodes:
+        after.append([node.value(*key) for key in settings])
     said = str(refused.value)
     assert said.startswith("J2 (node 2): found")
     for part in (found, "present device state", expected, remedy):
         assert part in said
     assert getattr(refused.value, "__notes__", []) == []
-    assert [[node.value(*key) for key in settings] for node in bus.nodes] == before
+    assert after == before
 
 
 @pytest.mark.parametrize(("modes", "named"), [(0b1, False), (0b1000_0000, True)])
@@ -443,8 +449,10 @@ def test_a_multiplexed_pdo_is_switched_off_and_on_again() -> None:
     bus.nodes[0].store(0x1A01, 0, 255)
     with network:
         network.prepare()
-        assert bus.nodes[0].value(0x1801, 1) >> 31 == 1
-    assert (bus.nodes[0].value(0x1801, 1), bus.nodes[0].value(0x1A01, 0)) == (0x281, 255)
+        found = bus.nodes[0].value(0x1801, 1) >> 31
+        assert found == 1
+    assert bus.nodes[0].value(0x1801, 1) == 0x281
+    assert bus.nodes[0].value(0x1A01, 0) == 255
 
 
 def test_a_drive_with_small_pdos_gets_more_of_them() -> None:
@@ -474,7 +482,8 @@ def test_a_lost_answer_is_asked_for_again_and_a_late_one_not_believed() -> None:
         access = network.link.objects(1)
         object_entry = ObjectEntry(0x1018, 1, 32, signed=False)
         assert access.read(object_entry) == 0x29A
-        assert access.read(ObjectEntry(0x6075, 0, 32, signed=False)) == 2000
+        found = access.read(ObjectEntry(0x6075, 0, 32, signed=False))
+        assert found == 2000
 
 
 def test_sdo_failures_name_node_object_and_reason() -> None:
@@ -513,7 +522,8 @@ def test_faults_are_reset_only_on_request_and_never_into_power() -> None:
         assert statusword & 0x4F == 0x08
         network.reset_faults()
         assert bus.nodes[1].statusword & 0x6F == 0x40
-    assert all(node.powered_cycles == 0 for node in bus.nodes)
+    for node in bus.nodes:
+        assert node.powered_cycles == 0
 
 
 def test_bus_off_is_an_error_and_other_error_frames_are_not() -> None:
@@ -557,11 +567,9 @@ def test_preparing_twice_still_restores_the_first_settings() -> None:
     with network:
         network.prepare()
         network.prepare()
-    assert (
-        bus.nodes[0].value(0x1800, 2),
-        bus.nodes[0].value(0x6060, 0),
-        bus.nodes[0].value(0x1017, 0),
-    ) == (255, 8, 0)
+    assert bus.nodes[0].value(0x1800, 2) == 255
+    assert bus.nodes[0].value(0x6060, 0) == 8
+    assert bus.nodes[0].value(0x1017, 0) == 0
 
 
 def test_a_step_of_restoring_that_fails_does_not_keep_the_others_from_it() -> None:
@@ -579,7 +587,8 @@ def test_an_ampere_that_cannot_be_true_is_refused_before_an_axis_has_power() -> 
     bus.nodes[1].store(0x6075, 0, 0)
     with pytest.raises(SetupRefused, match=r"node 2.*6075h:00 = 0"), network:
         network.prepare()
-    assert not any(node.powered_cycles for node in bus.nodes)
+    for node in bus.nodes:
+        assert not node.powered_cycles
     assert bus.nodes[0].value(0x6060, 0) == 8  # everything was given back
 
 

@@ -82,7 +82,8 @@ def _ignore(_old: tuple[ParameterValue, ...]) -> None:
 
 def _refusal(network: CanopenNetwork, saving: Saving = Saving.KNOWN) -> str:
     with network, pytest.raises(ParameterRefused) as refusal:
-        write_parameters(network, writes_of(network, NEW, NEW, NEW), saving, _ignore)
+        writes = writes_of(network, NEW, NEW, NEW)
+        write_parameters(network, writes, saving, _ignore)
     return str(refusal.value)
 
 
@@ -92,9 +93,14 @@ def test_a_parameter_is_read_with_the_identity_of_its_own_drive() -> None:
     bus.nodes[1].store(0x1018, 4, 8)
     network.axes = tuple(replace(axis, identity=None) for axis in network.axes)
     with network:
-        second, first = read_parameters(network, [(network.axes[1], GAIN), (network.axes[0], GAIN)])
-    assert (first.axis.name, first.word, first.value) == ("J1", OLD, 100.0)
-    assert (second.axis.name, second.word, second.value) == ("J2", 0xFFFF_FFFE, -2.0)
+        wanted = [(network.axes[1], GAIN), (network.axes[0], GAIN)]
+        second, first = read_parameters(network, wanted)
+    assert first.axis.name == "J1"
+    assert first.word == OLD
+    assert first.value == 100.0
+    assert second.axis.name == "J2"
+    assert second.word == 0xFFFF_FFFE
+    assert second.value == -2.0
     assert first.identity == Identity(0x29A, 0x40200, 7)
     assert second.identity == Identity(0x29A, 0x40200, 8)
     assert downloads(bus) == 0
@@ -109,15 +115,17 @@ def test_every_drive_is_written_read_back_and_saved() -> None:
         before.append(tuple(value.word for value in old))
 
     with network:
-        changes = write_parameters(network, writes_of(network, 201, OLD, 203), Saving.KNOWN, begin)
+        writes = writes_of(network, 201, OLD, 203)
+        changes = write_parameters(network, writes, Saving.KNOWN, begin)
     assert before == [(OLD, OLD, OLD)]
     assert gains(bus) == [201, OLD, 203]
     assert saves(bus) == [1, 2, 3]
-    assert changes == (
+    expected = (
         ParameterChange("J1", GAIN, OLD, 201, saved=True),
         ParameterChange("J2", GAIN, OLD, OLD, saved=True),
         ParameterChange("J3", GAIN, OLD, 203, saved=True),
     )
+    assert changes == expected
     # Two gains that change, and three saves.
     assert downloads(bus) == 5
 
@@ -128,7 +136,8 @@ def test_written_to_ram_nothing_is_saved() -> None:
         changes = write_parameters(network, writes_of(network, NEW), Saving.RAM, _ignore)
     assert gains(bus) == [NEW, OLD, OLD]
     assert saves(bus) == []
-    assert changes == (ParameterChange("J1", GAIN, OLD, NEW, saved=False),)
+    expected = (ParameterChange("J1", GAIN, OLD, NEW, saved=False),)
+    assert changes == expected
 
 
 def test_a_record_that_fails_before_the_first_write_leaves_the_drives_alone() -> None:
@@ -158,7 +167,8 @@ def test_power_that_comes_with_the_second_write_puts_the_first_back() -> None:
     first, second, _ = bus.nodes
     power_up(bus, lambda: second.value(0x2003, 1) == NEW)
     with network, pytest.raises(ParametersMixed) as failure:
-        write_parameters(network, writes_of(network, NEW, NEW, NEW), Saving.KNOWN, _ignore)
+        writes = writes_of(network, NEW, NEW, NEW)
+        write_parameters(network, writes, Saving.KNOWN, _ignore)
     # What has power is not written any more, so that drive keeps the new gain and is named.
     assert gains(bus) == [OLD, NEW, OLD]
     assert failure.value.restored == ("J1",)
@@ -184,7 +194,8 @@ def test_an_abort_puts_back_what_was_written_and_says_where() -> None:
     network, bus = drives()
     bus.nodes[1].aborts[0x2003, 1] = 0x0609_0030
     with network, pytest.raises(ObjectAccessError) as failure:
-        write_parameters(network, writes_of(network, NEW, NEW, NEW), Saving.KNOWN, _ignore)
+        writes = writes_of(network, NEW, NEW, NEW)
+        write_parameters(network, writes, Saving.KNOWN, _ignore)
     assert failure.value.abort_code == 0x0609_0030
     assert gains(bus) == [OLD, OLD, OLD]
     assert "kept: the previous values are restored in J1, J2" in failure.value.__notes__
@@ -195,7 +206,8 @@ def test_a_save_that_is_aborted_saves_the_old_values_where_new_ones_were_saved()
     network, bus = drives()
     bus.nodes[1].aborts[0x1010, 1] = 0x0800_0020
     with network, pytest.raises(ObjectAccessError) as failure:
-        write_parameters(network, writes_of(network, NEW, NEW, NEW), Saving.KNOWN, _ignore)
+        writes = writes_of(network, NEW, NEW, NEW)
+        write_parameters(network, writes, Saving.KNOWN, _ignore)
     assert gains(bus) == [OLD, OLD, OLD]
     # The second drive has saved nothing, as its abort says, and the third was not told to.
     assert saves(bus) == [1, 2, 1]

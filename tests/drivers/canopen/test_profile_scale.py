@@ -190,7 +190,8 @@ def test_a_scale_is_proportional_to_each_of_its_objects(
     whole = scale.ampere_per_unit(values, choice)
     assert whole > 0.0
     assert scale.ampere_per_unit((*values, 7), choice) == pytest.approx(7.0 * whole)
-    assert scale.ampere_per_unit(values, 2) == pytest.approx(4.0 * scale.ampere_per_unit(values, 0))
+    expected = 4.0 * scale.ampere_per_unit(values, 0)
+    assert scale.ampere_per_unit(values, 2) == pytest.approx(expected)
     with pytest.raises(IndexError):
         scale.ampere_per_unit(values, 3)
     with pytest.raises(IndexError):

@@ -65,7 +65,8 @@ def test_an_object_of_unbounded_length_is_no_reason_to_ask_again() -> None:
             ObjectAccessError, match="no end, expected at most 4096 bytes within 2 s"
         ):
             network.link.objects(1).read_bytes(NAME, 0)
-        assert network.link.objects(1).read(ObjectEntry(0x6075, 0, 32, signed=False)) == 2000
+        found = network.link.objects(1).read(ObjectEntry(0x6075, 0, 32, signed=False))
+        assert found == 2000
     frames = [
         frame for frame in bus.sent if frame.data[0] == 0x40 and about(bytes(frame.data)) == NAME
     ]
@@ -239,7 +240,8 @@ def test_a_node_that_boots_again_later_is_one_device() -> None:
     network, bus = cell(2)
     with network:
         states = [0, 127, 0, 127]
-        assert listen(network, bus, states, 300_000_000).shared_id(2, 0) == ""
+        found = listen(network, bus, states, 300_000_000).shared_id(2, 0)
+        assert found == ""
 
 
 @pytest.mark.parametrize(("every_ms", "shared"), [(50, True), (100, False)])
@@ -267,7 +269,8 @@ def test_heartbeats_of_two_states_in_turn_are_two_devices() -> None:
     with network:
         # One change may be commanded
         states = [5, 127, 5]
-        assert listen(network, bus, states, 100_000_000).shared_id(2, 0) == ""
+        found = listen(network, bus, states, 100_000_000).shared_id(2, 0)
+        assert found == ""
         assert listen(network, bus, [127, 5], 100_000_000).shared_id(2, 0) == (
             "heartbeats OPERATIONAL and PRE-OPERATIONAL in turn"
         )
@@ -292,13 +295,15 @@ def test_heartbeats_of_a_cell_in_lockstep_are_no_second_device() -> None:
     """Its time goes as fast as SYNC comes: heartbeats of 100 ms may come every 20 ms."""
     network, bus = cell(2)
     with network:
-        assert listen_beside_sync(network, bus, 30, 20).shared_id(2, 100) == ""
+        found = listen_beside_sync(network, bus, 30, 20).shared_id(2, 100)
+        assert found == ""
 
 
 def test_two_devices_are_found_by_their_heartbeats_once_no_sync_is_between_them() -> None:
     network, bus = cell(2)
     with network:
-        assert listen_beside_sync(network, bus, 30, 20).shared_id(2, 100) == ""
+        found = listen_beside_sync(network, bus, 30, 20).shared_id(2, 100)
+        assert found == ""
         states = [5] * 8
         link = listen(network, bus, states, 50_000_000)
         assert link.shared_id(2, 100) == "8 heartbeats in 350 ms, its period is 100 ms"

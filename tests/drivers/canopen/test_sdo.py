@@ -43,4 +43,5 @@ def test_an_answer_is_read_by_its_command_byte(answer: str, expected: UploadAnsw
 
 def test_a_request_names_the_object() -> None:
     request = upload_request(5, TORQUE)
-    assert (request.arbitration_id, request.data.hex(" ")) == (0x605, "40 77 60 00 00 00 00 00")
+    assert request.arbitration_id == 0x605
+    assert request.data.hex(" ") == "40 77 60 00 00 00 00 00"

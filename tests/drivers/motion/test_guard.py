@@ -87,8 +87,10 @@ def test_an_amplifier_that_refuses_to_watch_is_recorded_all_the_same(
         network.prepare()
         (said,) = network.unguarded()
         assert lack in said
-        assert (bus.nodes[0].value(0x1016, 1), bus.nodes[0].value(0x6007, 0)) == (entry, option)
-    assert (bus.nodes[0].value(0x1016, 1), bus.nodes[0].value(0x6007, 0)) == (0, 1)
+        assert bus.nodes[0].value(0x1016, 1) == entry
+        assert bus.nodes[0].value(0x6007, 0) == option
+    assert bus.nodes[0].value(0x1016, 1) == 0
+    assert bus.nodes[0].value(0x6007, 0) == 1
 
 
 def test_our_heartbeat_comes_in_its_period_while_axes_have_power_and_at_no_other_time() -> None:
@@ -118,7 +120,8 @@ def test_our_heartbeat_comes_in_its_period_while_axes_have_power_and_at_no_other
         list(execute(network, stream, (move,), permission()))
         count = len(beats_ns)
         assert count > 5
-        assert max(b - a for a, b in pairwise(beats_ns)) <= 1.5 * network.heartbeat_ms * 1e6
+        limit = 1.5 * network.heartbeat_ms * 1e6
+        assert max(b - a for a, b in pairwise(beats_ns)) <= limit
         # No watch while the log is finished
         assert [node.value(0x1016, 1) for node in bus.nodes] == [0, 0]
     assert len(beats_ns) == count
@@ -164,9 +167,9 @@ def test_a_node_id_that_another_device_uses_is_not_the_recorder_s(
     with network:
         network.prepare()
         assert network.recorder_id == 125
-        watched = [[node.value(0x1016, sub) for sub in (1, 2)] for node in bus.nodes[:2]]
-        expected = [[RECORDER << 16 | 500, 125 << 16 | 500]] * 2
-        assert watched == expected
+        for node in bus.nodes[:2]:
+            assert node.value(0x1016, 1) == RECORDER << 16 | 500
+            assert node.value(0x1016, 2) == 125 << 16 | 500
         pacing = LockstepSync(PERIOD_NS, 0.005, clock=bus.clock)
         stream = SyncStream(network, pacing)
         target_counts = (50_000, -40_000)
@@ -174,9 +177,10 @@ def test_a_node_id_that_another_device_uses_is_not_the_recorder_s(
         list(execute(network, stream, (move,), permission()))
         beats = {frame.arbitration_id for frame in bus.sent if frame.arbitration_id > 0x700}
         assert beats == {0x700 + 125}
-    assert [[node.value(0x1016, sub) for sub in (1, 2)] for node in bus.nodes[:2]] == [
-        [RECORDER << 16 | 500, 0]
-    ] * 2
+    for node in bus.nodes[:2]:
+        expected = RECORDER << 16 | 500
+        assert node.value(0x1016, 1) == expected
+        assert node.value(0x1016, 2) == 0
 
 
 def test_a_node_id_that_an_amplifier_waits_for_is_left_to_the_device_that_is_off_now() -> None:
@@ -189,7 +193,8 @@ def test_a_node_id_that_an_amplifier_waits_for_is_left_to_the_device_that_is_off
         assert network.recorder_id == 126
         assert bus.nodes[0].value(0x1016, 1) == 126 << 16 | 500
         assert [text.partition(":")[0] for text in network.unguarded()] == ["J2"]
-    assert [node.value(0x1016, 1) for node in bus.nodes] == [0, RECORDER << 16 | 2000]
+    expected = [0, RECORDER << 16 | 2000]
+    assert [node.value(0x1016, 1) for node in bus.nodes] == expected
 
 
 def test_what_a_killed_recorder_left_under_another_id_is_used_again() -> None:
@@ -199,7 +204,8 @@ def test_what_a_killed_recorder_left_under_another_id_is_used_again() -> None:
     give_guard(bus.nodes[0], entry)
     with network:
         network.prepare()
-        assert bus.nodes[0].value(0x1016, 1) == RECORDER << 16 | 500
+        expected = RECORDER << 16 | 500
+        assert bus.nodes[0].value(0x1016, 1) == expected
     assert bus.nodes[0].value(0x1016, 1) == 0
 
 
@@ -213,15 +219,16 @@ def test_a_device_with_any_node_id_leaves_the_recorder_an_id_of_its_own_or_the_r
             give_guard(node)
         join(bus, node_id, beat_ms=100)
         if node_id <= 2:
-            with pytest.raises(SetupRefused, match=f"J{node_id} .*two have it"), network:
+            pattern = f"J{node_id} .*two have it"
+            with pytest.raises(SetupRefused, match=pattern), network:
                 network.prepare()
             continue
         with network:
             network.prepare()
-            assert network.recorder_id == (126 if node_id == 127 else 127)
-            assert [node.value(0x1016, 1) >> 16 for node in bus.nodes[:2]] == [
-                network.recorder_id
-            ] * 2
+            expected = 126 if node_id == 127 else 127
+            assert network.recorder_id == expected
+            nodes = bus.nodes[:2]
+            assert [node.value(0x1016, 1) >> 16 for node in nodes] == [network.recorder_id] * 2
 
 
 def test_a_bus_without_a_free_node_id_is_refused_before_anything_is_set_up() -> None:
@@ -239,7 +246,8 @@ def test_a_bus_without_a_free_node_id_is_refused_before_anything_is_set_up() -> 
         network,
     ):
         network.prepare()
-    assert [node.value(0x1016, 1) for node in bus.nodes[:2]] == [0, 0]
+    nodes = bus.nodes[:2]
+    assert [node.value(0x1016, 1) for node in nodes] == [0, 0]
     assert all(node.powered_cycles == 0 for node in bus.nodes)
 
 
@@ -264,7 +272,8 @@ def test_a_device_with_our_node_id_that_comes_before_the_run_refuses_it(frame: c
                     permission(),
                 )
             )
-    assert all(node.powered_cycles == 0 for node in bus.nodes)
+    for node in bus.nodes:
+        assert node.powered_cycles == 0
 
 
 def frame_of_another(identifier: int) -> can.Message:
@@ -310,9 +319,8 @@ def test_another_master_that_writes_stops_the_axes(command: int) -> None:
     network, bus = cell(2)
     for node in bus.nodes:
         give_guard(node)
-    reading = can.Message(
-        arbitration_id=0x602, is_extended_id=False, data=bytes((0x40, 0x41, 0x60, 0, 0, 0, 0, 0))
-    )
+    data = bytes((0x40, 0x41, 0x60, 0, 0, 0, 0, 0))
+    reading = can.Message(arbitration_id=0x602, is_extended_id=False, data=data)
     writing = can.Message(
         arbitration_id=0x602, is_extended_id=False, data=bytes((command, 0x81, 0x60, 0, 1, 0, 0, 0))
     )
@@ -344,9 +352,8 @@ def test_another_master_that_only_reads_is_an_event_and_named_behind_a_late_move
     for node in bus.nodes:
         give_guard(node)
     arbitration_id = 0x600 + node_id
-    frame = can.Message(
-        arbitration_id=arbitration_id, is_extended_id=False, data=bytes((command, *bytes(7)))
-    )
+    data = bytes((command, *bytes(7)))
+    frame = can.Message(arbitration_id=arbitration_id, is_extended_id=False, data=data)
     events: list[CellEvent] = []
     with network:
         network.prepare()
@@ -356,10 +363,8 @@ def test_another_master_that_only_reads_is_an_event_and_named_behind_a_late_move
         stream = SyncStream(network, pacing, events.append)
         for _ in execute(network, stream, (MOVE,), permission()):
             pass
-        assert (
-            f"an SDO request to {'J2 (node 2)' if node_id == 2 else 'node 9'} "
-            f"(60{node_id}h)" in network.other_master()
-        )
+        expected = f"an SDO request to {'J2 (node 2)' if node_id == 2 else 'node 9'} (60{node_id}h)"
+        assert expected in network.other_master()
     codes = [event.code for event in events if event.kind is EventKind.BUS_BUSY]
     assert codes == [0x600 + node_id]
     late = MotionTimeout(0, (1,), (), 1.0, other_master=network.other_master())

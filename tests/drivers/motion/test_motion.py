@@ -71,9 +71,12 @@ def test_axes_start_together_arrive_and_end_without_power(moving: Moving) -> Non
     first = synchronised_move((0, 0), (50_000, -40_000), permission().limits, dwell_cycles=7)
     second = synchronised_move((50_000, -40_000), (0, 10_000), permission().limits, dwell_cycles=3)
     samples = run(moving, first, second)
-    assert samples[-1].position_counts == (0, 10_000)
-    assert [sample.cycle for sample in samples] == list(range(len(samples)))
-    assert bus.nodes[0].setpoint_cycles == bus.nodes[1].setpoint_cycles
+    position_counts = samples[-1].position_counts
+    assert position_counts == (0, 10_000)
+    cycles = [sample.cycle for sample in samples]
+    assert cycles == list(range(len(samples)))
+    expected = bus.nodes[1].setpoint_cycles
+    assert bus.nodes[0].setpoint_cycles == expected
     assert len(bus.nodes[0].setpoint_cycles) == 2
     marks = [event for event in events if event.kind in MARKS]
     assert [(mark.kind, mark.code) for mark in marks] == [
@@ -104,10 +107,11 @@ def test_the_time_limit_of_a_stop_ends_with_a_stop_that_is_confirmed(moving: Mov
 def test_the_profile_objects_are_those_of_the_move(moving: Moving) -> None:
     _, _, bus, _ = moving
     run(moving, FAR)
-    written = [
-        tuple(node.value(index, 0) for index in (0x6081, 0x6083, 0x6084)) for node in bus.nodes
-    ]
-    assert written == [(100_000, 1_000_000, 1_000_000), (80_000, 800_000, 800_000)]
+    written = []
+    for node in bus.nodes:
+        written.append((node.value(0x6081, 0), node.value(0x6083, 0), node.value(0x6084, 0)))
+    expected = [(100_000, 1_000_000, 1_000_000), (80_000, 800_000, 800_000)]
+    assert written == expected
 
 
 def test_an_axis_with_no_way_to_go_gets_no_setpoint(moving: Moving) -> None:
@@ -115,14 +119,16 @@ def test_an_axis_with_no_way_to_go_gets_no_setpoint(moving: Moving) -> None:
     samples = run(
         moving, Move((5_000, 0), (100_000, 1), (1_000_000, 1)), Move((5_000, 0), (1, 1), (1, 1), 4)
     )
-    assert samples[-1].position_counts == (5_000, 0)
+    position_counts = samples[-1].position_counts
+    assert position_counts == (5_000, 0)
     assert bus.nodes[1].setpoint_cycles == []
 
 
 def test_a_drive_that_needs_its_controlword_twice_still_moves(moving: Moving) -> None:
     _, _, bus, _ = moving
     bus.nodes[0].second_controlword = bus.nodes[1].second_controlword = True
-    assert run(moving, FAR)[-1].position_counts == (50_000, -40_000)
+    position_counts = run(moving, FAR)[-1].position_counts
+    assert position_counts == (50_000, -40_000)
 
 
 def test_nothing_is_sent_to_an_axis_whose_position_is_unknown(moving: Moving) -> None:
@@ -131,11 +137,10 @@ def test_nothing_is_sent_to_an_axis_whose_position_is_unknown(moving: Moving) ->
         node.position = 30_000.0
     bus.tamper = lambda m: () if m.arbitration_id == 0x182 and bus.cycle < 2 else (m,)
     run(moving, Move((30_000, 20_000), (100_000, 100_000), (1_000_000, 1_000_000)))
-    targets = [
-        int.from_bytes(frame.data[:4], "little", signed=True)
-        for frame in bus.sent
-        if frame.arbitration_id == 0x202
-    ]
+    targets = []
+    for frame in bus.sent:
+        if frame.arbitration_id == 0x202:
+            targets.append(int.from_bytes(frame.data[:4], "little", signed=True))
     assert min(targets) == 20_000
 
 
@@ -239,7 +244,8 @@ def test_an_interrupt_inside_of_a_cycle_stops_all_axes(moving: Moving) -> None:
     with pytest.raises(KeyboardInterrupt):
         run(moving, FAR)
     assert powerless(bus)
-    assert [event.text for event in events if event.kind is EventKind.ENDED] == ["interrupted"]
+    texts = [event.text for event in events if event.kind is EventKind.ENDED]
+    assert texts == ["interrupted"]
 
 
 def test_a_fault_during_the_last_stop_is_not_forgotten(moving: Moving) -> None:
@@ -277,7 +283,8 @@ def test_a_drive_that_holds_its_acknowledge_until_it_has_arrived_makes_every_mov
         node.holds_acknowledge = True
     back = Move((0, 0), (100_000, 80_000), (1_000_000, 800_000))
     samples = run(moving, FAR, back, FAR)
-    assert samples[-1].position_counts == (50_000, -40_000)
+    position_counts = samples[-1].position_counts
+    assert position_counts == (50_000, -40_000)
     assert [len(node.setpoint_cycles) for node in bus.nodes] == [3, 3]
 
 
@@ -321,9 +328,11 @@ def test_a_drive_whose_rpdos_act_before_sync_makes_the_same_moves(moving: Moving
         node.acts_at_once = True
     back = Move((0, 0), (100_000, 80_000), (1_000_000, 800_000))
     samples = run(moving, FAR, back)
-    assert samples[-1].position_counts == (0, 0)
+    position_counts = samples[-1].position_counts
+    assert position_counts == (0, 0)
     assert [len(node.setpoint_cycles) for node in bus.nodes] == [2, 2]
-    assert not any(sample.missing for sample in samples)
+    for sample in samples:
+        assert not sample.missing
     assert powerless(bus)
 
 
@@ -346,7 +355,8 @@ def test_a_target_reached_bit_of_the_move_before_is_not_believed(moving: Moving)
 @pytest.mark.parametrize("way", [40, 1000, 2500])
 def test_a_short_move_does_not_end_by_a_bit_of_the_move_before(moving: Moving, way: int) -> None:
     _, _, bus, events = moving
-    out = synchronised_move((0, 0), (way, way), (AxisLimits(0, 0, 20_000, 200_000),) * 2)
+    limits = (AxisLimits(0, 0, 20_000, 200_000),) * 2
+    out = synchronised_move((0, 0), (way, way), limits)
     duration_s = max(out.duration_s((0, 0)))
 
     def hold_bit(_: int) -> None:
@@ -357,7 +367,8 @@ def test_a_short_move_does_not_end_by_a_bit_of_the_move_before(moving: Moving, w
     samples = run(moving, out, Move((way, way), (1, 1), (1, 1)))
     start, end = (event.time_ns for event in events if event.kind in MARKS and event.code == 0)
     assert (end - start) * 1e-9 == pytest.approx(duration_s, abs=2e-3)
-    assert samples[-1].position_counts == (way, way)
+    position_counts = samples[-1].position_counts
+    assert position_counts == (way, way)
     at_end = next(sample for sample in samples if sample.time_ns >= end)
     assert at_end.position_counts == (way, way)
 
@@ -381,7 +392,8 @@ def test_a_setpoint_that_still_waits_is_dropped_by_the_stop(
         run(moving, FAR)
     assert last_profile in [frame.arbitration_id for frame in bus.sent]
     controlwords = [frame.data[4] for frame in bus.sent if frame.arbitration_id in (0x201, 0x202)]
-    assert not any(word & 0x10 for word in controlwords)
+    for word in controlwords:
+        assert not word & 0x10
     assert [node.setpoint_cycles for node in bus.nodes] == [[], []]
     assert powerless(bus)
 
@@ -407,7 +419,8 @@ def stop_with(moving: Moving, drift_counts: tuple[float, ...]) -> list[int]:
 
 
 def test_an_encoder_that_flickers_stands_still(moving: Moving) -> None:
-    stopping = stop_with(moving, (3.0, -5.0, 2.0, 0.0))
+    drift_counts = (3.0, -5.0, 2.0, 0.0)
+    stopping = stop_with(moving, drift_counts)
     assert len(stopping) < 20
     assert powerless(moving[2])
 
@@ -455,11 +468,8 @@ def test_late_answers_are_waited_for_once_no_axis_has_power(
     bus.nodes[0].quick_stop_stays = not confirmed
     near = Move((500, 500), (100_000, 100_000), (10_000_000, 10_000_000))
     with suppress(StateRefused):
-        list(
-            execute(
-                moving[0], stream, (near,), permission(), replace(BOUNDS, standstill_cycles=10_000)
-            )
-        )
+        bounds = replace(BOUNDS, standstill_cycles=10_000)
+        list(execute(moving[0], stream, (near,), permission(), bounds))
     assert waits == [(periods, confirmed)]
 
 
@@ -532,7 +542,8 @@ def test_why_the_moves_end_is_in_the_log(moving: Moving) -> None:
     kinds = [event.kind for event in events]
     (ended,) = [event for event in events if event.kind is EventKind.ENDED]
     assert ended.text.startswith("MotionTimeout: move 0: J2 (node 2) did not")
-    assert kinds.index(EventKind.ENDED) < kinds.index(EventKind.STOP)
+    limit = kinds.index(EventKind.STOP)
+    assert kinds.index(EventKind.ENDED) < limit
 
 
 def test_moves_that_were_made_end_for_no_reason(moving: Moving) -> None:
@@ -596,7 +607,8 @@ def test_amplifiers_that_were_not_seen_to_stop_go_on_watching_us(
         if cycle == 60:
             bus.nodes[1].fault()
         if EventKind.STOP in [event.kind for event in events]:
-            bus.nodes[0].statusword = bus.nodes[0].statusword & ~0x6F | 0x27
+            statusword = bus.nodes[0].statusword
+            bus.nodes[0].statusword = statusword & ~0x6F | 0x27
 
     bus.on_cycle = deaf
     ended: list[str] = []

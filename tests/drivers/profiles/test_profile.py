@@ -30,19 +30,24 @@ def test_an_object_is_written_in_the_way_of_cia_301() -> None:
 def test_a_product_scale_is_the_factor_times_all_objects() -> None:
     entries = (ObjectEntry(0x6075, 0, 32), ObjectEntry(0x2000, 1, 32))
     # 1e-6 A times 2000 mA times 3.
-    assert CurrentScale(1e-6, entries).ampere_per_unit((2000, 3)) == pytest.approx(6e-3)
+    found = CurrentScale(1e-6, entries).ampere_per_unit((2000, 3))
+    assert found == pytest.approx(6e-3)
 
 
 def test_a_switch_of_the_scale_chooses_its_weight() -> None:
+    weights = (1.0, 1.0 / math.sqrt(2.0))
+    objects = (ObjectEntry(0x6075, 0, 32),)
+    switch = ObjectEntry(0x2002, 0x54, 16)
     scale = CurrentScale(
         1e-6,
-        (ObjectEntry(0x6075, 0, 32),),
+        objects,
         ScaleForm.SWITCHED_PER_MILLE,
-        ObjectEntry(0x2002, 0x54, 16),
-        (1.0, 1.0 / math.sqrt(2.0)),
+        switch,
+        weights,
     )
     assert scale.ampere_per_unit((2000,)) == pytest.approx(2e-3)
-    assert scale.ampere_per_unit((2000,), 1) == pytest.approx(2e-3 / math.sqrt(2.0))
+    expected = 2e-3 / math.sqrt(2.0)
+    assert scale.ampere_per_unit((2000,), 1) == pytest.approx(expected)
 
 
 @pytest.mark.parametrize("choice", [-1, 1, 2])
@@ -52,7 +57,8 @@ def test_an_unknown_value_of_the_switch_has_no_scale(choice: int) -> None:
 
 
 def test_the_standards_drive_has_the_objects_of_cia_402() -> None:
-    assert CIA402.position == ObjectEntry(0x6064, 0, 32, signed=True)
+    expected = ObjectEntry(0x6064, 0, 32, signed=True)
+    assert CIA402.position == expected
     assert CIA402.current == ObjectEntry(0x6074, 0, 16, signed=True)
     assert CIA402.current_scale.objects == (ObjectEntry(0x6075, 0, 32),)
     # 6074h is per mille of the rated current, and 6075h is in mA.
@@ -63,9 +69,9 @@ def test_the_standards_drive_has_the_objects_of_cia_402() -> None:
 
 
 def test_rated_values_are_in_thousandths_as_the_standard_has_them() -> None:
-    assert CIA402.rated == RatedMotor(
-        ObjectEntry(0x6075, 0, 32), 1e-3, ObjectEntry(0x6076, 0, 32), 1e-3
-    )
+    current = ObjectEntry(0x6075, 0, 32)
+    torque = ObjectEntry(0x6076, 0, 32)
+    assert CIA402.rated == RatedMotor(current, 1e-3, torque, 1e-3)
 
 
 @pytest.mark.parametrize(
@@ -85,7 +91,8 @@ CONFIGURED = Identity(0x1A, 0x2B, 77)
 
 def test_a_drive_with_every_field_as_configured_has_no_difference() -> None:
     assert CONFIGURED.differences(CONFIGURED) == ()
-    assert Identity(0x1A).differences(Identity(0x1A, 5, 6)) == ()
+    found = Identity(0x1A).differences(Identity(0x1A, 5, 6))
+    assert found == ()
 
 
 def test_each_field_that_differs_is_named_beside_one_that_agrees() -> None:
@@ -127,7 +134,8 @@ def test_a_number_becomes_the_bits_of_its_type_and_comes_back(
 def test_a_whole_number_is_the_nearest_and_a_real_one_keeps_its_fraction() -> None:
     assert DriveParameter(0x2000, 1, ParameterKind.I16).word(2.6) == 3
     real = DriveParameter(0x2000, 1, ParameterKind.F32)
-    assert real.value(real.word(2.6)) == struct.unpack("<f", struct.pack("<f", 2.6))[0]
+    expected = struct.unpack("<f", struct.pack("<f", 2.6))[0]
+    assert real.value(real.word(2.6)) == expected
 
 
 @pytest.mark.parametrize(
@@ -142,7 +150,8 @@ def test_a_whole_number_is_the_nearest_and_a_real_one_keeps_its_fraction() -> No
 def test_a_number_beyond_its_type_is_refused_with_type_and_object(
     kind: ParameterKind, value: float
 ) -> None:
-    with pytest.raises(ValueError, match=f"{kind.value} 2000h:01"):
+    pattern = f"{kind.value} 2000h:01"
+    with pytest.raises(ValueError, match=pattern):
         DriveParameter(0x2000, 1, kind).word(value)
 
 

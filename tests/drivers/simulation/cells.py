@@ -120,7 +120,8 @@ class Master:
         for controlword in (0x06, 0x07, 0x0F):
             self.control(node_ids, controlword)
             answer = self.sync(len(node_ids))
-        assert all(word & 0x6F == 0x27 for _, _, word in answer), answer
+        for _, _, word in answer:
+            assert word & 0x6F == 0x27, answer
 
     def control(self, node_ids: range, controlword: int) -> None:
         """Controlword of all nodes by RPDO; it acts on the next SYNC."""

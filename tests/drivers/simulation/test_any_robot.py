@@ -112,7 +112,9 @@ def test_the_loops_are_tuned_over_the_travel_of_a_prismatic_joint() -> None:
     """
     spec = _spec()
     plant = Plant(spec)
-    seen = [1.0 + 1.0 + 0.1 + BEHIND_KG * reach**2 + 0.5 for reach in (0.1, 1.1)]
+    seen = []
+    for reach in (0.1, 1.1):
+        seen.append(1.0 + 1.0 + 0.1 + BEHIND_KG * reach**2 + 0.5)
     position_rad = np.array([0.3, 0.2, 1.1])
     assert plant.motor_inertia_at(position_rad)[0] == pytest.approx(seen[1])
     counts_per_rad = 65536 / (2 * np.pi)
@@ -136,7 +138,8 @@ def test_the_loops_are_tuned_for_a_body_and_for_none() -> None:
     without = tuned_inertia_a_s2(bare, Plant(bare))
     loaded = replace(bare, payload=body)
     with_body = tuned_inertia_a_s2(loaded, Plant(loaded))
-    assert found[1] == pytest.approx(np.sqrt(without[1] * with_body[1]))
+    expected = np.sqrt(without[1] * with_body[1])
+    assert found[1] == pytest.approx(expected)
     # Whatever is mounted at power-on.
     carrying = replace(tuned, payload=body)
     assert tuned_inertia_a_s2(carrying, Plant(carrying)) == pytest.approx(found)

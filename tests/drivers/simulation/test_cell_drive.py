@@ -79,10 +79,11 @@ def settings(network: CanopenNetwork) -> list[tuple[bytes, ...]]:
         (0x1400, 2),
         (0x1600, 0),
     )
-    return [
-        tuple(network.link.objects(node_id).read_bytes(index, sub) for index, sub in objects)
-        for node_id in network.node_ids
-    ]
+    found = []
+    for node_id in network.node_ids:
+        node = network.link.objects(node_id)
+        found.append(tuple(node.read_bytes(index, sub) for index, sub in objects))
+    return found
 
 
 @pytest.mark.slow
@@ -133,7 +134,8 @@ def test_scan_prepare_move_and_give_back(address: BusAddress, axes: tuple[Axis, 
             assert abs(position - wanted) < 2000
         assert any(any(sample.current_raw) for sample in recorded)
     with CanopenNetwork(address, axes, guard_ms=GUARD_MS, bounds=PATIENT) as network:
-        states = {node.state for node in network.scan(range(1, 7))}
+        nodes = network.scan(range(1, 7))
+        states = {node.state for node in nodes}
         assert states == {State.SWITCH_ON_DISABLED}
         assert settings(network) == before
 
@@ -156,7 +158,8 @@ def test_a_closed_run_leaves_no_axis_with_power(
                     break
         stopped = next(stream)
         assert max(stopped.position_counts[0] - start[0], 0) < 300_000
-        assert all(word & 0x6F == 0x40 for word in stopped.statusword)
+        for word in stopped.statusword:
+            assert word & 0x6F == 0x40
 
 
 @pytest.mark.slow
@@ -179,12 +182,14 @@ def test_an_emergency_of_a_node_stops_the_others(
             ):
                 for sample in samples:
                     if sample.cycle == 100:
+                        data = b"\x10\x23\x03" + bytes(5)
                         emcy = can.Message(
                             arbitration_id=0x83,
                             is_extended_id=False,
-                            data=b"\x10\x23\x03" + bytes(5),
+                            data=data,
                         )
                         intruder.send(emcy)
-            assert all(word & 0x6F == 0x40 for word in network.statuswords())
+            for word in network.statuswords():
+                assert word & 0x6F == 0x40
     finally:
         intruder.shutdown()

@@ -64,7 +64,7 @@ def test_moves_are_reached_and_the_loops_stay_closed(
                 assert master.write(node, index, 0, kind, value) == 0
         master.control(nodes, 0x1F)
         answers = [master.sync(len(spec.axes)) for _ in range(450)]
-        words = np.array([[word for _, _, word in answer] for answer in answers])
+        words = np.array(answers)[:, :, 2]
         last_word = words[-1]
         assert (last_word & REACHED).all()
         assert not (words & FOLLOWING_ERROR).any()
@@ -75,7 +75,8 @@ def test_moves_are_reached_and_the_loops_stay_closed(
         assert (np.abs(difference) <= 655).all()
         plant = there.plant
         assert plant.mechanism is not None
-        assert np.abs(plant.mechanism.at(plant.position_rad)[0]).max() < 1e-11
+        largest_error = np.abs(plant.mechanism.at(plant.position_rad)[0]).max()
+        assert largest_error < 1e-11
 
 
 def test_redundant_drives_preload_the_platform_while_their_trapezoids_disagree() -> None:
@@ -99,7 +100,8 @@ def test_redundant_drives_preload_the_platform_while_their_trapezoids_disagree()
         amplifiers.loops["demand"] = amplifiers.loops["target"] = np.rint(counts(spec, joint))
         amplifiers.control(plant.motor_rad)
         plant.step(amplifiers.loops["current_a"])
-        torque = plant._rows.T @ (plant._gain * amplifiers.loops["current_a"])
+        current_a = amplifiers.loops["current_a"]
+        torque = plant._rows.T @ (plant._gain * current_a)
         hidden = np.linalg.svd(plant._basis[:4].T)[2][3]  # the null space of Aᵀ
         inner.append(abs(hidden @ torque))
     assert max(inner[:2000]) > 1.0  # [Nm]; friction of a motor is 0.3

@@ -151,7 +151,8 @@ def test_accelerations_are_those_of_a_solution_with_multipliers(name: str, paylo
         q = plant.position_rad.copy()
         jacobian, _ = reference.rows(q, np.zeros(n))
         v = plant._basis @ rng.uniform(-1.0, 1.0, plant.mechanism.mobility)
-        assert np.abs(jacobian @ v).max() < 1e-12
+        largest_error = np.abs(jacobian @ v).max()
+        assert largest_error < 1e-12
         # The speed of a step is closed where the step began, J_c(q − h v) v = 0, so that J_c(q) v =
         # h J̇_c v at its end.
         change = reference.rows(q, v)[1]
@@ -187,10 +188,8 @@ def test_accelerations_from_rest_are_those_of_pinocchio(name: str) -> None:
     data = model.createData()
     constraints = pin.StdVec_RigidConstraintModel()
     for closure in spec.closures:
-        first, second = (
-            model.frames[model.getFrameId(link, pin.FrameType.BODY)]
-            for link in (closure.first, closure.second)
-        )
+        links = (closure.first, closure.second)
+        first, second = (model.frames[model.getFrameId(link, pin.FrameType.BODY)] for link in links)
         # A plane closes the third translation by itself; two points on the free axis close the two
         # other rotations.
         points = [np.zeros(3)]
@@ -266,9 +265,10 @@ def test_the_rods_of_the_orthoglide_follow_from_its_design_rule() -> None:
     factors = []
     grid = np.linspace(-0.073, 0.127, 5)
     for corner in np.stack(np.meshgrid(*[grid] * 3), axis=-1).reshape(-1, 3):
-        columns = [
-            (slides_of(corner + 1e-6 * e) - slides_of(corner - 1e-6 * e)) / 2e-6 for e in np.eye(3)
-        ]
+        columns = []
+        for e in np.eye(3):
+            place_m = corner + 1e-6 * e
+            columns.append((slides_of(place_m) - slides_of(corner - 1e-6 * e)) / 2e-6)
         factors.append(1.0 / np.linalg.svd(np.array(columns).T, compute_uv=False))
     assert np.min(factors) == pytest.approx(0.5, abs=0.005)
     assert np.max(factors) == pytest.approx(2.0, abs=0.02)
@@ -283,7 +283,8 @@ def test_a_five_bar_follows_its_lagrangian() -> None:
     rng = np.random.default_rng(8)
     changed_spec = replace(spec, payload=None)
     model = link_model(changed_spec)
-    bodies = {name: model.inertias[model.getJointId(name)] for name in model.names[1:]}
+    names = model.names[1:]
+    bodies = {name: model.inertias[model.getJointId(name)] for name in names}
     crank_m = 0.25
     rod_m = 0.45
     zero = {
@@ -323,7 +324,8 @@ def test_a_five_bar_follows_its_lagrangian() -> None:
             mass[2 + k, 2 + k] = link.inertia[2, 2] + link.mass * r @ r
             rod_difference = rod[k] - angle[k]
             along = np.cos(rod_difference)
-            beside = np.sin(rod[k] - angle[k])
+            phase_rad = rod[k] - angle[k]
+            beside = np.sin(phase_rad)
             mass[k, 2 + k] = mass[2 + k, k] = link.mass * crank_m * (r[0] * along - r[1] * beside)
             push = link.mass * crank_m * (r[0] * beside + r[1] * along)
             bias[k] = -push * rates[2 + k] ** 2
@@ -397,7 +399,8 @@ def test_closures_hold_in_a_long_run_and_friction_only_takes_energy(name: str) -
     stiffness = 60.0 * np.abs(motor_inertia)
     worst = 0.0
     for k in range(4000):
-        place = 0.12 * np.sin(2 * np.pi * 1.1 * k * plant._mechanics.step_s + np.arange(n))
+        phase_rad = 2 * np.pi * 1.1 * k * plant._mechanics.step_s + np.arange(n)
+        place = 0.12 * np.sin(phase_rad)
         place *= 0.3 if name == "orthoglide" else 1.0
         place_difference = place - plant.position_rad[:n]
         pull = stiffness * place_difference - 0.1 * stiffness * plant.velocity_rad_s[:n]
@@ -422,7 +425,8 @@ def test_a_mechanism_loaded_below_its_friction_stays_exactly_where_it_is(name: s
     start = plant.position_rad.copy()
     below = np.array([0.9 * a.coulomb_nm / abs(a.gain_nm_per_a) for a in spec.axes])
     for k in range(60):
-        plant.step(below * np.cos(k / 7.0 + np.arange(len(spec.axes))))
+        phase_rad = k / 7.0 + np.arange(len(spec.axes))
+        plant.step(below * np.cos(phase_rad))
         assert (plant.velocity_rad_s == 0.0).all()
     assert (plant.position_rad == start).all()
     for _ in range(40):
@@ -489,7 +493,8 @@ def test_a_serial_plant_takes_the_same_step_as_before() -> None:
     motor = np.zeros(6)
     bound = other._bound * other._mechanics.step_s
     for k in range(300):
-        current = 1.5 * np.sin(0.01 * k * np.arange(1.0, 7.0))
+        phase_rad = 0.01 * k * np.arange(1.0, 7.0)
+        current = 1.5 * np.sin(phase_rad)
         plant.step(current)
         mass = np.ascontiguousarray(pin.crba(model, data, position))
         bias = pin.nonLinearEffects(model, data, position, velocity)
@@ -538,12 +543,14 @@ def test_what_does_not_close_or_move_is_refused() -> None:
         Plant(replace(spec, assembly_rad=assembly_rad))
     ratio = np.eye(1)
     start_rad = np.zeros(1)
+    motors = spec.motors[:1]
+    axes = spec.axes[:1]
     with pytest.raises(SpecInvalid, match="2 degrees of freedom"):
         Plant(
             replace(
                 spec,
-                motors=spec.motors[:1],
-                axes=spec.axes[:1],
+                motors=motors,
+                axes=axes,
                 ratio=ratio,
                 start_rad=start_rad,
             )
@@ -580,18 +587,21 @@ def test_a_closure_of_two_rotations_leaves_the_third_free() -> None:
     <inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial></link></robot>"""  # noqa: E501
     axes = cell("five-bar").axes
     axis = replace(axes[0], motor_inertia_kg_m2=0.5, viscous_nm_s_rad=0.0, coulomb_nm=0.0)
+    closures = (Closure("hinge", "base", "door", ("x", "y", "z", "rx", "ry")),)
+    start_rad = np.array([1.2])
     spec = replace(
         cell("five-bar"),
         urdf=urdf,
         axes=(replace(axis, offset_nm=0.0),),
         ratio=np.eye(1),
-        closures=(Closure("hinge", "base", "door", ("x", "y", "z", "rx", "ry")),),
+        closures=closures,
         motors=("hinge",),
         platform=None,
         passive={},
         assembly_rad={"hinge": 0.1},
-        start_rad=np.array([1.2]),
+        start_rad=start_rad,
     )
     plant = released(spec)
     plant.step(np.array([1.0]))
-    assert plant.velocity_rad_s[0] == pytest.approx(7.36 / 1.5 * plant._mechanics.step_s)
+    expected = 7.36 / 1.5 * plant._mechanics.step_s
+    assert plant.velocity_rad_s[0] == pytest.approx(expected)

@@ -90,7 +90,8 @@ def test_odd_friction_opposes_the_motion_with_its_law(axis: int, direction: floa
         ),
     )
     for effect, size in cases:
-        np.testing.assert_allclose(extra_torque_nm(effect, speed), only(axis, -s * size), atol=1e-6)
+        expected = only(axis, -s * size)
+        np.testing.assert_allclose(extra_torque_nm(effect, speed), expected, atol=1e-6)
 
 
 @pytest.mark.parametrize("load_nm", [-20.0, 0.0, 5.0, 10.0])
@@ -152,9 +153,8 @@ def test_spring_depends_on_position_alone() -> None:
     parameters = {"stiffness_nm_per_rad": 30.0, "rest_rad": 0.2}
     effect = UndeclaredEffect("spring", 1, parameters)
     for speed in (SPEED, -SPEED):
-        np.testing.assert_allclose(
-            extra_torque_nm(effect, speed), only(1, -30.0 * (POSTURE[1] - 0.2)), atol=1e-6
-        )
+        expected = only(1, -30.0 * (POSTURE[1] - 0.2))
+        np.testing.assert_allclose(extra_torque_nm(effect, speed), expected, atol=1e-6)
 
 
 @pytest.mark.parametrize("name", ["cable", "slack-cable"])
@@ -172,11 +172,11 @@ def test_a_cable_pulls_both_joints_that_it_is_led_around(name: str, rest_m: floa
             return 0.0
         return 1250.0 * stretch_m**2
 
-    slopes = [
-        energy(POSTURE + only(joint, 1e-5)) - energy(POSTURE - only(joint, 1e-5))
-        for joint in range(6)
-    ]
-    np.testing.assert_allclose(extra_torque_nm(effect), -np.array(slopes) / 2e-5, atol=1e-5)
+    slopes = []
+    for joint in range(6):
+        slopes.append(energy(POSTURE + only(joint, 1e-5)) - energy(POSTURE - only(joint, 1e-5)))
+    expected = -np.array(slopes) / 2e-5
+    np.testing.assert_allclose(extra_torque_nm(effect), expected, atol=1e-5)
 
 
 def test_a_clipped_current_gives_no_more_than_its_limit() -> None:
@@ -186,18 +186,18 @@ def test_a_clipped_current_gives_no_more_than_its_limit() -> None:
         largest_current = max(current, -2.0)
         given_a = min(largest_current, 2.0)
         lost = gain * (current - given_a)
-        np.testing.assert_allclose(
-            extra_torque_nm(effect, current=only(0, current)), only(0, -lost), atol=1e-6
-        )
+        actual = extra_torque_nm(effect, current=only(0, current))
+        expected = only(0, -lost)
+        np.testing.assert_allclose(actual, expected, atol=1e-6)
 
 
 def test_an_offset_that_drifts_fades_with_time() -> None:
     parameters = {"offset_nm": 3.0, "time_constant_s": 50.0}
     effect = UndeclaredEffect("offset-drift", 1, parameters)
-    np.testing.assert_allclose(extra_torque_nm(effect), only(1, -3.0), atol=1e-6)
-    np.testing.assert_allclose(
-        extra_torque_nm(effect, time_s=100.0), only(1, -3.0 * math.exp(-2.0)), atol=1e-6
-    )
+    expected = only(1, -3.0)
+    np.testing.assert_allclose(extra_torque_nm(effect), expected, atol=1e-6)
+    actual = extra_torque_nm(effect, time_s=100.0)
+    np.testing.assert_allclose(actual, only(1, -3.0 * math.exp(-2.0)), atol=1e-6)
 
 
 @given(angle=st.floats(-3.0, 3.0))
@@ -231,9 +231,8 @@ def test_a_counterbalance_gives_the_work_of_its_force(angle: float) -> None:
     difference = energy(angle + 1e-5) - energy(angle - 1e-5)
     expected = -difference / 2e-5
     posture = np.where(np.arange(6) == 1, angle, POSTURE)
-    np.testing.assert_allclose(
-        extra_torque_nm(effect, posture=posture), only(1, expected), atol=1e-4
-    )
+    actual = extra_torque_nm(effect, posture=posture)
+    np.testing.assert_allclose(actual, only(1, expected), atol=1e-4)
 
 
 def test_position_friction_follows_the_joint_angle_and_the_sign_of_speed() -> None:
@@ -244,7 +243,8 @@ def test_position_friction_follows_the_joint_angle_and_the_sign_of_speed() -> No
         posture_cosine = math.cos(posture[2] - 0.4)
         speed_sign = np.sign(SPEED[2])
         expected = only(2, -2.0 * posture_cosine * speed_sign)
-        np.testing.assert_allclose(extra_torque_nm(effect, posture=posture), expected, atol=1e-6)
+        actual = extra_torque_nm(effect, posture=posture)
+        np.testing.assert_allclose(actual, expected, atol=1e-6)
 
 
 def test_cogging_repeats_with_the_motor_and_acts_along_its_gear() -> None:
@@ -253,10 +253,12 @@ def test_cogging_repeats_with_the_motor_and_acts_along_its_gear() -> None:
     ratio = clean_cell().ratio
     for turn in (0.0, 0.01, 2 * np.pi / (4 * 32)):
         posture = POSTURE + only(5, turn)
-        ripple = -0.7 * math.sin(4.0 * float(ratio[5] @ posture))
+        phase_rad = 4.0 * float(ratio[5] @ posture)
+        ripple = -0.7 * math.sin(phase_rad)
         # Motor 6 pulls on joints 5 and 6 (eq. 24)
         expected = np.array([0.0, 0.0, 0.0, 0.0, ripple, ripple])
-        np.testing.assert_allclose(extra_torque_nm(effect, posture=posture), expected, atol=1e-6)
+        actual = extra_torque_nm(effect, posture=posture)
+        np.testing.assert_allclose(actual, expected, atol=1e-6)
 
 
 def test_saturation_takes_a_cubic_share_of_the_torque() -> None:
@@ -275,9 +277,8 @@ def test_warm_up_fades_with_time() -> None:
     cold = extra_torque_nm(effect)[0]
     later = extra_torque_nm(effect, time_s=100.0)[0]
     axis = clean_cell().axes[0]
-    assert cold == pytest.approx(
-        -0.5 * (axis.coulomb_nm + axis.viscous_nm_s_rad * SPEED[0]), rel=0.02
-    )
+    expected = -0.5 * (axis.coulomb_nm + axis.viscous_nm_s_rad * SPEED[0])
+    assert cold == pytest.approx(expected, rel=0.02)
     assert later / cold == pytest.approx(math.exp(-1.0), rel=1e-3)
 
 
@@ -310,9 +311,8 @@ def test_losses_heat_a_drive_to_their_balance_and_its_friction_follows() -> None
         if step == 99:
             assert 0.6 < above_k / (0.4 * (18.0 + dry_w + viscous_w)) < 0.66
     # At the balance the temperature is resistance times losses.
-    assert moment.temperature_c[0] - 25.0 == pytest.approx(
-        0.4 * (18.0 + dry_w + viscous_w), rel=1e-3
-    )
+    expected = 0.4 * (18.0 + dry_w + viscous_w)
+    assert moment.temperature_c[0] - 25.0 == pytest.approx(expected, rel=1e-3)
 
 
 def test_a_plant_without_that_effect_stays_at_the_temperature_of_its_surroundings() -> None:
@@ -342,7 +342,8 @@ def test_presliding_builds_up_over_its_distance_after_a_reversal() -> None:
         travelled += 0.4 * STEP_S
         torque.append(float(moment.torque_nm[0]))
         assert moment.bound_nm[0] == 2.0
-        assert torque[-1] == pytest.approx(-3.0 * (1.0 - 2.0 * math.exp(-travelled / 0.01)))
+        expected = -3.0 * (1.0 - 2.0 * math.exp(-travelled / 0.01))
+        assert torque[-1] == pytest.approx(expected)
     assert torque[0] > 2.5
     assert torque[-1] < -2.9
 
@@ -353,9 +354,8 @@ def test_coupling_rubs_on_the_sum_of_two_joints() -> None:
     same = SPEED.copy()
     same[3:5] = [0.5, 0.9]
     size = -(0.4 + 0.3 * 1.4)
-    np.testing.assert_allclose(
-        extra_torque_nm(effect, same), only(3, size) + only(4, size), atol=1e-6
-    )
+    expected = only(3, size) + only(4, size)
+    np.testing.assert_allclose(extra_torque_nm(effect, same), expected, atol=1e-6)
     against = SPEED.copy()
     against[3:5] = [0.9, -0.4]
     size = -(0.4 + 0.3 * 0.5)
@@ -388,7 +388,8 @@ def test_an_elastic_drive_twists_by_torque_over_stiffness() -> None:
     effect = UndeclaredEffect("elasticity", 0, parameters)
     gain = clean_cell().axes[0].gain_nm_per_a
     for current in (-1.0, 2.0):
-        assert held_twist_rad(effect, current) == pytest.approx(gain * current / 8000.0, rel=1e-6)
+        expected = gain * current / 8000.0
+        assert held_twist_rad(effect, current) == pytest.approx(expected, rel=1e-6)
 
 
 def test_a_drive_with_backlash_has_its_gap_between_both_flanks() -> None:
@@ -396,7 +397,8 @@ def test_a_drive_with_backlash_has_its_gap_between_both_flanks() -> None:
     effect = UndeclaredEffect("backlash", 0, parameters)
     gain = clean_cell().axes[0].gain_nm_per_a
     lost = held_twist_rad(effect, 1.0) - held_twist_rad(effect, -1.0)
-    assert lost == pytest.approx(0.002 + 2 * gain / 8000.0, rel=1e-3)
+    expected = 0.002 + 2 * gain / 8000.0
+    assert lost == pytest.approx(expected, rel=1e-3)
 
 
 def test_lag_is_of_first_order() -> None:
@@ -405,7 +407,8 @@ def test_lag_is_of_first_order() -> None:
         reported = np.array([1.0, 1.0])
         lag.report(reported, STEP_S)
         assert reported[0] == 1.0
-        assert reported[1] == pytest.approx(1.0 - math.exp(-k * STEP_S / 0.005))
+        expected = 1.0 - math.exp(-k * STEP_S / 0.005)
+        assert reported[1] == pytest.approx(expected)
 
 
 @given(

@@ -68,13 +68,15 @@ def test_axes_of_a_killed_master_come_to_rest_without_sync(
         absolute_velocity_rad_s = np.abs(cell.plant.velocity_rad_s)
         assert absolute_velocity_rad_s.min() > 0.5
         frozen = cell.cycles
-        let_go_on(master, clock, 0.001 * GUARD_MS - 0.04)
+        seconds = 0.001 * GUARD_MS - 0.04
+        let_go_on(master, clock, seconds)
         # The guard has not expired: a late master finds everything as it was
         assert cell.cycles == frozen
         let_go_on(master, clock, 2.0)
         states = {node.drive.state for node in cell.nodes}
         assert states == {state}
-        assert np.abs(cell.plant.velocity_rad_s).max() < 1e-3
+        largest_error = np.abs(cell.plant.velocity_rad_s).max()
+        assert largest_error < 1e-3
         rested = cell.cycles
         assert 100 < rested - frozen < 1000
         let_go_on(master, clock, 1.0)
@@ -98,7 +100,8 @@ def test_an_axis_that_watches_no_one_ends_its_move_as_at_a_bus_with_time_of_its_
         expected = [PowerState.OPERATION_ENABLED, *[PowerState.SWITCH_ON_DISABLED] * 5]
         assert states == expected
         assert cell.plant.position_rad[0] == pytest.approx(spec.start_rad[0] + 0.8, abs=0.01)
-        assert cell.plant.position_rad[1] < spec.start_rad[1] + 0.7
+        limit = spec.start_rad[1] + 0.7
+        assert cell.plant.position_rad[1] < limit
 
 
 def test_an_axis_that_is_only_switched_on_goes_off_with_its_master(
@@ -128,7 +131,8 @@ def test_a_sync_ends_the_time_without_sync(request: pytest.FixtureRequest) -> No
         begin_move(master, spec, target, 0.5, 0.1)
         for _ in range(CYCLES):
             master.sync()
-        let_go_on(master, clock, 0.001 * GUARD_MS + 0.06)
+        seconds = 0.001 * GUARD_MS + 0.06
+        let_go_on(master, clock, seconds)
         stopping = cell.cycles
         states = {node.drive.state for node in cell.nodes}
         assert states == {PowerState.QUICK_STOP_ACTIVE}
@@ -146,17 +150,21 @@ def test_a_cell_that_a_busy_machine_held_up_does_not_blame_its_master(
     clock = Clock()
     with running(spec, request.node.name, clock) as (cell, master):
         set_up(master)
-        begin_move(master, spec, spec.start_rad + 0.8, 0.5, 0.1)
+        target = spec.start_rad + 0.8
+        begin_move(master, spec, target, 0.5, 0.1)
         for _ in range(CYCLES):
             master.sync()
         clock.now_s += 4.0 * 0.001 * GUARD_MS
         for _ in range(3):
             master.sync()
             master.send(0x700 + RECORDER, b"\x05")
-        assert {node.drive.state for node in cell.nodes} == {PowerState.OPERATION_ENABLED}
-        assert cell.cycles == CYCLES + 3 + ENABLING
+        states = {node.drive.state for node in cell.nodes}
+        assert states == {PowerState.OPERATION_ENABLED}
+        expected = CYCLES + 3 + ENABLING
+        assert cell.cycles == expected
         # A master that is gone is still found, one guard time later.
-        let_go_on(master, clock, 0.001 * GUARD_MS + 0.06)
+        seconds = 0.001 * GUARD_MS + 0.06
+        let_go_on(master, clock, seconds)
         assert {node.drive.state for node in cell.nodes} == {PowerState.QUICK_STOP_ACTIVE}
 
 

@@ -54,10 +54,12 @@ def test_an_independent_sdo_client_understands_the_server(request: pytest.Fixtur
         try:
             node = network.add_node(3, canopen.ObjectDictionary())
             # Segmented
-            assert node.sdo.upload(0x1008, 0).decode() == "drivegain simulated CiA 402 amplifier"
+            text = node.sdo.upload(0x1008, 0).decode()
+            assert text == "drivegain simulated CiA 402 amplifier"
             packed = struct.pack("<I", 1234)
             node.sdo.download(0x6081, 0, packed)
-            assert node.sdo.upload(0x6081, 0) == struct.pack("<I", 1234)
+            expected = struct.pack("<I", 1234)
+            assert node.sdo.upload(0x6081, 0) == expected
             node.sdo.download(0x6083, 0, struct.pack("<I", 77), force_segment=True)
             assert node.sdo.upload(0x6083, 0) == struct.pack("<I", 77)
             with pytest.raises(canopen.SdoAbortedError) as caught:
@@ -126,7 +128,8 @@ def test_synchronous_receive_pdos_wait_for_sync_and_event_driven_ones_do_not(
 ) -> None:
     master.set_up(SIX)
     master.control(SIX, 0x06)
-    assert master.read(1, 0x6041, 0, "H") & 0x6F == 0x40
+    found = master.read(1, 0x6041, 0, "H") & 0x6F
+    assert found == 0x40
     master.sync()
     assert master.read(1, 0x6041, 0, "H") & 0x6F == 0x21
     assert master.write(1, 0x1400, 2, "B", 255) == 0
@@ -139,7 +142,8 @@ def test_event_driven_transmit_pdo_reports_a_change_of_state(master: Master) -> 
     assert master.receive()[0] == 0x701  # boot-ups first
     for _ in range(5):
         master.receive()
-    assert master.receive() == (0x184, struct.pack("<H", 0x0250))
+    expected = (0x184, struct.pack("<H", 0x0250))
+    assert master.receive() == expected
     assert master.write(4, 0x6040, 0, "H", 0x06) == 0
     assert master.receive() == (0x184, struct.pack("<H", 0x0231))
 
@@ -197,7 +201,8 @@ def test_reset_brings_back_defaults_or_what_was_saved(master: Master) -> None:
     master.send(0x000, bytes([0x81, 6]))
     assert master.read(6, 0x6081, 0, "I") == default
     assert master.write(6, 0x6081, 0, "I", 4321) == 0
-    assert master.write(6, 0x1010, 1, "I", int.from_bytes(b"save", "little")) == 0
+    found = master.write(6, 0x1010, 1, "I", int.from_bytes(b"save", "little"))
+    assert found == 0
     assert master.write(6, 0x6081, 0, "I", 99) == 0
     master.send(0x000, bytes([0x81, 6]))
     assert master.read(6, 0x6081, 0, "I") == 4321
@@ -222,6 +227,9 @@ def test_no_object_reports_the_true_gain(request: pytest.FixtureRequest) -> None
             known = [
                 key for key in entries if key in cell.nodes[0]._dictionary and key != (0x1003, 1)
             ]
-            reported.append([node.read(*key) for node in cell.nodes for key in known])
+            objects: list[bytes] = []
+            for node in cell.nodes:
+                objects += [node.read(*key) for key in known]
+            reported.append(objects)
     assert len(reported[0]) > 200
     assert reported[0] == reported[1]

@@ -71,9 +71,8 @@ def test_coloured_noise_has_its_deviation_and_its_correlation_from_the_first_val
             expected = np.exp(-lag * STEP_S / correlation_s)
         else:
             expected = float(lag == 0)
-        assert np.mean(values[0] * values[lag]) / sigma**2 == pytest.approx(
-            expected, abs=5.0 * np.sqrt(2.0 / n)
-        )
+        found = np.mean(values[0] * values[lag]) / sigma**2
+        assert found == pytest.approx(expected, abs=5.0 * np.sqrt(2.0 / n))
 
 
 def test_the_disturbance_is_a_share_of_the_rated_torque_with_its_correlation_time() -> None:
@@ -85,7 +84,8 @@ def test_the_disturbance_is_a_share_of_the_rated_torque_with_its_correlation_tim
         values = np.zeros((1, 6))
     rated_nm = np.array([abs(axis.gain_nm_per_a) * axis.rated_current_a for axis in spec.axes])
     # 10 s are 2 500 independent values of a correlation time of 2 ms.
-    np.testing.assert_allclose(values.std(axis=0) / rated_nm, 0.01 * PERCENT, rtol=0.06)
+    actual = values.std(axis=0) / rated_nm
+    np.testing.assert_allclose(actual, 0.01 * PERCENT, rtol=0.06)
     centred = values - values.mean(axis=0)
     centred_variance = centred.var(axis=0)
     correlation = (centred[8:] * centred[:-8]).mean(axis=0) / centred_variance

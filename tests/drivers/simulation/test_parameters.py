@@ -63,10 +63,10 @@ def test_nothing_is_stored_while_the_motor_has_power(request: pytest.FixtureRequ
 def test_an_amplifier_may_refuse(
     request: pytest.FixtureRequest, kind: FaultKind, gain: int, save: int
 ) -> None:
-    spec = replace(clean_cell(), faults=(FaultSpec(kind, 1),))
+    faults = (FaultSpec(kind, 1),)
+    spec = replace(clean_cell(), faults=faults)
     with running(spec, request.node.name) as (_, master):
-        assert (master.write(2, GAIN, 1, "i", 5), master.write(2, 0x1010, 1, "I", SAVE)) == (
-            gain,
-            save,
-        )
-        assert (master.write(1, GAIN, 1, "i", 5), master.write(1, 0x1010, 1, "I", SAVE)) == (0, 0)
+        assert master.write(2, GAIN, 1, "i", 5) == gain
+        assert master.write(2, 0x1010, 1, "I", SAVE) == save
+        assert master.write(1, GAIN, 1, "i", 5) == 0
+        assert master.write(1, 0x1010, 1, "I", SAVE) == 0

@@ -66,22 +66,18 @@ def test_inverse_dynamics_gives_back_the_applied_torque(payload: str | None) -> 
     plant.set_brakes(OPEN)
     model, data = links(spec)
     rows = motor_rows(spec.ratio)
-    gain, inertia, viscous, coulomb, motor_viscous, motor_coulomb, offset = (
-        np.array([getattr(axis, name) for axis in spec.axes])
-        for name in (
-            "gain_nm_per_a",
-            "motor_inertia_kg_m2",
-            "viscous_nm_s_rad",
-            "coulomb_nm",
-            "motor_viscous_nm_s_rad",
-            "motor_coulomb_nm",
-            "offset_nm",
-        )
-    )
+    gain = np.array([axis.gain_nm_per_a for axis in spec.axes])
+    inertia = np.array([axis.motor_inertia_kg_m2 for axis in spec.axes])
+    viscous = np.array([axis.viscous_nm_s_rad for axis in spec.axes])
+    coulomb = np.array([axis.coulomb_nm for axis in spec.axes])
+    motor_viscous = np.array([axis.motor_viscous_nm_s_rad for axis in spec.axes])
+    motor_coulomb = np.array([axis.motor_coulomb_nm for axis in spec.axes])
+    offset = np.array([axis.offset_nm for axis in spec.axes])
     step_s = 0.25e-3
     checked = 0
     for k in range(1200):
-        current = 1.5 * np.sin(2 * np.pi * np.array([2.0, 2.3, 3.1, 3.7, 4.1, 5.3]) * k * step_s)
+        phase_rad = 2 * np.pi * np.array([2.0, 2.3, 3.1, 3.7, 4.1, 5.3]) * k * step_s
+        current = 1.5 * np.sin(phase_rad)
         q = plant.position_rad.copy()
         v = plant.velocity_rad_s.copy()
         plant.step(current)
@@ -95,7 +91,8 @@ def test_inverse_dynamics_gives_back_the_applied_torque(payload: str | None) -> 
         needed = pin.rnea(model, data, q, v, a) + rows.T @ (inertia * (rows @ a))
         needed += viscous * after + coulomb * np.sign(after) + offset
         needed += rows.T @ (motor_viscous * motor + motor_coulomb * np.sign(motor))
-        np.testing.assert_allclose(rows.T @ (gain * current), needed, atol=1e-6)
+        actual = rows.T @ (gain * current)
+        np.testing.assert_allclose(actual, needed, atol=1e-6)
         checked += 1
     assert checked > 600
 
@@ -130,7 +127,8 @@ def test_friction_and_brakes_only_take_energy() -> None:
             plant.set_brakes(rng.random(6) < 0.3)
         before = plant.velocity_rad_s.copy()
         plant.step(rng.normal(0.0, 2.0, 6))
-        assert friction_nm(plant) @ plant.velocity_rad_s <= 1e-9 * (1.0 + np.abs(before).max())
+        limit = 1e-9 * (1.0 + np.abs(before).max())
+        assert friction_nm(plant) @ plant.velocity_rad_s <= limit
 
 
 @given(
@@ -168,11 +166,8 @@ def test_a_joint_loaded_above_its_friction_moves_that_way(joint: int, sign: floa
     ]
     # Motor 6 rubs on joints 5 and 6, so both bounds are given in full.
     coulomb_nm = spec.axes[joint].coulomb_nm
-    own = (
-        coulomb_nm
-        + spec.axes[joint].motor_coulomb_nm
-        + (joint == 4) * spec.axes[5].motor_coulomb_nm
-    )
+    motor_coulomb_nm = spec.axes[joint].motor_coulomb_nm
+    own = coulomb_nm + motor_coulomb_nm + (joint == 4) * spec.axes[5].motor_coulomb_nm
     load[joint] += sign * 1.2 * own
     plant = Plant(spec)
     plant.set_brakes(OPEN)
@@ -238,11 +233,12 @@ def test_a_payload_adds_exactly_its_weight_to_what_the_brakes_hold(payload: str)
         return float(body.mass_kg * 9.81 * data.oMi[6].act(centre_m)[2])
 
     step = 1e-6
-    expected = [
-        (potential_j(spec.start_rad + step * e) - potential_j(spec.start_rad - step * e))
-        / (2 * step)
-        for e in np.eye(6)
-    ]
+    expected = []
+    for e in np.eye(6):
+        expected.append(
+            (potential_j(spec.start_rad + step * e) - potential_j(spec.start_rad - step * e))
+            / (2 * step)
+        )
     difference = held[payload] - held[None]
     np.testing.assert_allclose(difference, expected, atol=1e-6)
 
@@ -285,4 +281,5 @@ def test_a_motor_on_another_joint_brakes_that_joint() -> None:
         plant.step(np.zeros(6))
     assert plant.velocity_rad_s[1] != 0.0  # joint 2 falls, for the brake of its motor is open
     assert plant.velocity_rad_s[0] == 0.0
-    assert plant.motor_rad[0] == pytest.approx(32.0 * plant.position_rad[1])
+    expected = 32.0 * plant.position_rad[1]
+    assert plant.motor_rad[0] == pytest.approx(expected)

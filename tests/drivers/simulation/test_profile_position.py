@@ -43,12 +43,14 @@ def test_a_move_ends_at_rest_on_its_target_within_its_limits(
     scale = 1.0 + abs(start) + abs(target) + velocity**2 / min(acceleration, deceleration)
     assert move.target == target
     assert position == pytest.approx(target, abs=1e-6 * scale)
-    assert abs(left) <= 1e-6 * (1.0 + fastest)
+    limit = 1e-6 * (1.0 + fastest)
+    assert abs(left) <= limit
     largest_speed = max(speed, abs(velocity))
     assert fastest <= largest_speed * (1.0 + 1e-9)
     assert len(move.duration_s) == SEGMENTS
     assert min(move.duration_s) >= 0.0
-    assert all(abs(a) in (0.0, acceleration, deceleration) for a in move.acceleration)
+    for a in move.acceleration:
+        assert abs(a) in (0.0, acceleration, deceleration)
 
 
 def test_a_textbook_trapezoid() -> None:
@@ -67,6 +69,7 @@ def test_a_stop_ends_at_rest_where_it_says(
     assert position == pytest.approx(
         move.target, abs=1e-6 * (1.0 + abs(start) + velocity**2 / deceleration)
     )
-    assert abs(left) <= 1e-6 * (1.0 + abs(velocity))
+    limit = 1e-6 * (1.0 + abs(velocity))
+    assert abs(left) <= limit
     travel = move.target - start
     assert travel * velocity >= 0.0

@@ -15,7 +15,8 @@ LEFT = frozenset((0,))
 
 def test_one_bus_needs_no_node_ids() -> None:
     gate = SyncGate(1)
-    assert [gate.arrive(0) for _ in range(3)] == [(LEFT,)] * 3
+    expected = [(LEFT,)] * 3
+    assert [gate.arrive(0) for _ in range(3)] == expected
     assert not gate.open
 
 
@@ -29,7 +30,8 @@ def test_a_cycle_begins_with_the_last_sync_whatever_their_order() -> None:
 
 def test_a_bus_without_sync_is_not_waited_for_for_ever() -> None:
     gate = SyncGate(2)
-    assert [gate.arrive(0) for _ in range(PATIENCE)] == [()] * PATIENCE
+    expected = [()] * PATIENCE
+    assert [gate.arrive(0) for _ in range(PATIENCE)] == expected
     assert gate.arrive(0) == (LEFT,) * (PATIENCE + 1)
     assert gate.arrive(0) == (LEFT,)
 

@@ -29,18 +29,23 @@ def alarms(
 
 
 def test_an_axis_that_shows_nothing_new_is_reported_in_its_bound() -> None:
-    assert alarms([7] * 100, [3] * 100)[0] == round(FROZEN_S * 1e9 / PERIOD_NS)
+    expected = round(FROZEN_S * 1e9 / PERIOD_NS)
+    assert alarms([7] * 100, [3] * 100)[0] == expected
 
 
 @settings(deadline=None)
 @given(st.integers(0, 39), st.booleans())
 def test_one_count_in_position_or_current_is_life(beat: int, of_current: bool) -> None:
     alive = [(cycle + beat) // 40 for cycle in range(500)]
-    assert alarms([7] * 500 if of_current else alive, alive if of_current else [3] * 500) == []
+    positions = [7] * 500 if of_current else alive
+    currents = alive if of_current else [3] * 500
+    assert alarms(positions, currents) == []
 
 
 def test_a_repeated_value_of_a_lost_sample_proves_nothing() -> None:
-    assert alarms([7] * 500, [3] * 500, [int(cycle % 40 == 0) for cycle in range(500)]) == []
+    missing = [int(cycle % 40 == 0) for cycle in range(500)]
+    found = alarms([7] * 500, [3] * 500, missing)
+    assert found == []
 
 
 def _sample(cycle: int, positions: tuple[int, int], missing: int = 0) -> Sample:
@@ -58,7 +63,8 @@ def test_the_second_of_two_moving_axes_is_found_although_the_first_lives() -> No
 
 def test_a_set_point_that_creeps_proves_nothing_until_it_has_gone_far_enough() -> None:
     # 640 counts/s: 64 counts, the least way, in 100 ms and the ramp's half of 0.64 ms.
-    data = FrozenData(Move((1000,), (640,), (1_000_000,)), (0,), (0,), PERIOD_NS)
+    move = Move((1000,), (640,), (1_000_000,))
+    data = FrozenData(move, (0,), (0,), PERIOD_NS)
     found = []
     for cycle in range(150):
         sample = Sample(cycle, cycle * PERIOD_NS, (7,), (3,), (0x27,))
@@ -69,5 +75,7 @@ def test_a_set_point_that_creeps_proves_nothing_until_it_has_gone_far_enough() -
 
 def test_the_way_begins_with_the_first_sample_and_not_with_the_first_cycle() -> None:
     data = FrozenData(MOVE, (0, 0), (0,), PERIOD_NS)
-    found = [bool(data.frozen(_sample(1000 + cycle, (7, 7)))) for cycle in range(60)]
+    found = []
+    for cycle in range(60):
+        found.append(bool(data.frozen(_sample(1000 + cycle, (7, 7)))))
     assert found.index(True) == 50

@@ -79,20 +79,22 @@ def test_each_overheard_cycle_is_a_sample_and_a_gap_is_counted(bus: QuietBus) ->
     monitor.period_ns = 10_000_000
     start = bus.clock.now_ns
     for cycle in (*range(20), *range(25, 40)):  # five SYNCs that this program missed
-        frames = overheard_cycle(
-            start + (cycle + 1) * 10_000_000, cycle, silent=3 if cycle == 30 else None
-        )
+        silent = 3 if cycle == 30 else None
+        at_ns = start + (cycle + 1) * 10_000_000
+        frames = overheard_cycle(at_ns, cycle, silent=silent)
         frames[0][1].timestamp = 1.7e9 + 0.01 * cycle
         bus.coming += frames
     monitor.watch(0.5)
     # The last may still be answered
-    assert [sample.cycle for sample in samples] == [*range(20), *range(25, 39)]
+    cycles = [sample.cycle for sample in samples]
+    assert cycles == [*range(20), *range(25, 39)]
     assert [sample.cycle for sample in samples if sample.missing] == [30]
     assert samples[25].missing == 0b100
     for sample in samples:
         position = [1000 * node + sample.cycle for node in range(1, 7)]
         assert sample.missing or list(sample.position_counts) == position
-        assert sample.current_raw == (-1, -2, -3, -4, -5, -6)
+        expected = (-1, -2, -3, -4, -5, -6)
+        assert sample.current_raw == expected
         assert sample.statusword == (0x1237,) * 6
 
 
@@ -101,15 +103,15 @@ def test_a_quiet_bus_is_asked_by_uploads_alone_and_silence_is_counted(bus: Quiet
     monitor.watch(QUIET_S - 0.01)
     assert bus.sent == []
     reading = monitor.watch(9.5 * ABANDONED_S)
-    assert {message.arbitration_id for message in bus.sent} == {
-        0x600 + node for node in range(1, 7)
-    }
+    arbitration_ids = {message.arbitration_id for message in bus.sent}
+    expected = {0x600 + node for node in range(1, 7)}
+    assert arbitration_ids == expected
     assert {message.data[0] for message in bus.sent} == {0x40}
     assert reading.source is ReadingSource.ASKED
-    assert all(
-        8 <= axis.lost <= 10 and axis.position_counts is None and axis.rate_hz == 0
-        for axis in reading.axes
-    )
+    for axis in reading.axes:
+        assert 8 <= axis.lost <= 10
+        assert axis.position_counts is None
+        assert axis.rate_hz == 0
     assert not any(axis.heard for axis in reading.axes)
 
 
@@ -119,7 +121,8 @@ def test_asking_ends_when_another_master_speaks(bus: QuietBus, identifier: int) 
     monitor.watch(QUIET_S + 0.1)
     asked = len(bus.sent)
     bus.coming.append((bus.clock.now_ns, frame(identifier, bytes(8))))
-    assert monitor.watch(QUIET_S - 0.01).source is ReadingSource.OVERHEARD
+    source = monitor.watch(QUIET_S - 0.01).source
+    assert source is ReadingSource.OVERHEARD
     assert len(bus.sent) <= asked + 6  # those that left before it spoke
     asked = len(bus.sent)
     monitor.watch(0.1)
@@ -143,10 +146,12 @@ def test_a_late_answer_to_another_client_is_no_reading(bus: QuietBus) -> None:
     monitor.watch(QUIET_S + 0.01)
     other = bytes((0x43, 0x75, 0x60, 0)) + struct.pack("<I", 2000)
     bus.coming.append((bus.clock.now_ns, frame(0x581, other)))
-    assert monitor.watch(0.05).axes[0].position_counts is None
+    axes = monitor.watch(0.05).axes
+    assert axes[0].position_counts is None
     mine = bytes((0x43, 0x64, 0x60, 0)) + struct.pack("<i", -7)
     bus.coming.append((bus.clock.now_ns, frame(0x581, mine)))
-    assert monitor.watch(0.05).axes[0].position_counts == -7
+    position_counts = monitor.watch(0.05).axes[0].position_counts
+    assert position_counts == -7
 
 
 @pytest.mark.parametrize("identifier", [0x081, 0x181, 0x701])
@@ -154,8 +159,12 @@ def test_a_node_that_only_sends_by_itself_is_not_silent(bus: QuietBus, identifie
     monitor = monitor_of(bus)
     monitor.watch(QUIET_S)
     bus.coming.append((bus.clock.now_ns + 200_000_000, frame(identifier, b"\x05")))
-    assert [axis.heard for axis in monitor.watch(1.5).axes] == [True, *[False] * 5]
-    assert not any(axis.heard for axis in monitor.watch(0.5).axes)  # longer ago than ABANDONED_S
+    axes = monitor.watch(1.5).axes
+    heards = [axis.heard for axis in axes]
+    expected = [True, *[False] * 5]
+    assert heards == expected
+    for axis in monitor.watch(0.5).axes:
+        assert not axis.heard  # longer ago than ABANDONED_S
 
 
 def test_overheard_readings_are_those_of_our_mapping_with_rates_and_frames(bus: QuietBus) -> None:
@@ -163,18 +172,20 @@ def test_overheard_readings_are_those_of_our_mapping_with_rates_and_frames(bus: 
     start = bus.clock.now_ns
     for cycle in range(100):
         silent = 3 if cycle in (50, 51) else None
-        bus.coming += overheard_cycle(start + (cycle + 1) * 10_000_000, cycle, silent)
+        at_ns = start + (cycle + 1) * 10_000_000
+        bus.coming += overheard_cycle(at_ns, cycle, silent)
     reading = monitor.watch(1.0)
     assert bus.sent == []
     assert reading.source is ReadingSource.OVERHEARD
     assert reading.seconds == pytest.approx(1.0)
     # The hundredth SYNC comes with the end of the second; its answers come behind it.
     assert reading.sync_hz == pytest.approx(100.0)
-    assert [axis.position_counts for axis in reading.axes] == [
-        1000 * node + 98 for node in range(1, 7)
-    ]
-    assert [axis.current_raw for axis in reading.axes] == [-1, -2, -3, -4, -5, -6]
-    assert [axis.rate_hz for axis in reading.axes] == pytest.approx([99, 99, 97, 99, 99, 99])
+    expected = [1000 * node + 98 for node in range(1, 7)]
+    assert [axis.position_counts for axis in reading.axes] == expected
+    current_raw = [axis.current_raw for axis in reading.axes]
+    assert current_raw == [-1, -2, -3, -4, -5, -6]
+    rate_hz = [axis.rate_hz for axis in reading.axes]
+    assert rate_hz == pytest.approx([99, 99, 97, 99, 99, 99])
     assert [axis.lost for axis in reading.axes] == [0, 0, 2, 0, 0, 0]
     assert reading.frames == ((100, 0, 0, 0, 0, 0, 0, 0, 6 * 99 - 2),)
 
@@ -183,12 +194,14 @@ def test_each_reading_counts_its_own_time_alone(bus: QuietBus) -> None:
     monitor = monitor_of(bus)
     start = bus.clock.now_ns
     for cycle in range(30):
-        bus.coming += overheard_cycle(start + (cycle + 1) * 10_000_000, cycle)
+        at_ns = start + (cycle + 1) * 10_000_000
+        bus.coming += overheard_cycle(at_ns, cycle)
     monitor.watch(0.205)
     reading = monitor.watch(0.205)
     assert reading.seconds == pytest.approx(0.205)
     assert reading.sync_hz == pytest.approx(10 / 0.205)
-    assert reading.axes[0].rate_hz == pytest.approx(10 / 0.205)
+    rate_hz = reading.axes[0].rate_hz
+    assert rate_hz == pytest.approx(10 / 0.205)
     assert reading.frames[0][8] == 60
 
 
@@ -196,7 +209,9 @@ def test_a_frame_of_another_mapping_is_no_value(bus: QuietBus) -> None:
     monitor = monitor_of(bus)
     bus.coming.append((bus.clock.now_ns + 1000, frame(0x181, bytes(6))))
     axis = monitor.watch(0.01).axes[0]
-    assert (axis.position_counts, axis.current_raw, axis.statusword) == (None, None, None)
+    assert axis.position_counts is None
+    assert axis.current_raw is None
+    assert axis.statusword is None
     assert axis.rate_hz == 0.0
 
 
@@ -217,14 +232,17 @@ def test_queried_values_are_samples_with_wall_time_ten_times_a_second(
     answer_all(bus, monkeypatch, reply)
     reading = monitor.watch(1.0)
     assert reading.source is ReadingSource.ASKED
-    assert [axis.position_counts for axis in reading.axes] == [
-        70_000 + node for node in range(1, 7)
-    ]
-    assert {axis.current_raw for axis in reading.axes} == {-10}
-    assert {axis.statusword for axis in reading.axes} == {0x237}
+    expected = [70_000 + node for node in range(1, 7)]
+    assert [axis.position_counts for axis in reading.axes] == expected
+    current_raw = {axis.current_raw for axis in reading.axes}
+    assert current_raw == {-10}
+    statuswords = {axis.statusword for axis in reading.axes}
+    assert statuswords == {0x237}
     assert {axis.lost for axis in reading.axes} == {0}
-    assert reading.axes[0].rate_hz == pytest.approx(10.0, abs=1.0)
-    assert reading.axes[0].delay_s == pytest.approx(0.002, abs=0.002)
+    rate_hz = reading.axes[0].rate_hz
+    assert rate_hz == pytest.approx(10.0, abs=1.0)
+    delay_s = reading.axes[0].delay_s
+    assert delay_s == pytest.approx(0.002, abs=0.002)
     assert len(samples) == pytest.approx(10, abs=1)
     last = samples[-1]
     assert last.missing == 0
@@ -252,7 +270,8 @@ def test_a_queried_axis_that_stops_to_answer_is_missing_from_then_on(
     dead.append(2)
     monitor.watch(2 * READING_S + ANSWER_S + 0.2)
     assert samples[-1].missing == 0b10
-    assert samples[-1].position_counts[1] == 7
+    position_counts = samples[-1].position_counts
+    assert position_counts[1] == 7
 
 
 def test_a_request_that_is_abandoned_begins_the_reading_again(bus: QuietBus) -> None:
@@ -284,7 +303,9 @@ def test_an_aborted_object_is_named_until_it_is_given(
     answer_all(bus, monkeypatch, reply)
     axis = monitor.watch(0.5).axes[0]
     assert axis.refused == (ObjectRefusal(STATUSWORD, 0x0602_0000),)
-    assert (axis.statusword, axis.rate_hz, axis.heard) == (None, 0.0, True)
+    assert axis.statusword is None
+    assert axis.rate_hz == 0.0
+    assert axis.heard is True
     aborting[0] = False
     axis = monitor.watch(0.5).axes[0]
     assert axis.refused == ()
@@ -296,7 +317,8 @@ def test_heartbeats_and_emergencies_of_axes_are_reported(bus: QuietBus) -> None:
     bus.coming.append((bus.clock.now_ns + 1000, frame(0x702, b"\x05")))
     bus.coming.append((bus.clock.now_ns + 2000, frame(0x083, bytes.fromhex("1186010000000000"))))
     reading = monitor.watch(0.1)
-    assert [axis.nmt for axis in reading.axes] == [None, 5, None, None, None, None]
+    nmts = [axis.nmt for axis in reading.axes]
+    assert nmts == [None, 5, None, None, None, None]
     emergencies = [event for event in reading.events if event.kind is EventKind.EMCY]
     assert [(event.axis, event.code) for event in emergencies] == [(2, 0x8611)]
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
+from itertools import product
 
 import can
 import pytest
@@ -89,7 +90,8 @@ def bench() -> Iterator[Bench]:
 def test_readings_are_in_si_and_come_at_their_rates(bench: Bench) -> None:
     bench.poll()
     samples = [next(bench.stream) for _ in range(CYCLES)]
-    assert all(sample.missing == 0 for sample in samples)
+    for sample in samples:
+        assert sample.missing == 0
     values = {(r.axis, r.quantity): r.value for r in bench.readings}
     assert values == pytest.approx(
         {
@@ -102,7 +104,8 @@ def test_readings_are_in_si_and_come_at_their_rates(bench: Bench) -> None:
         own = [r.time_ns for r in bench.readings if (r.axis, r.quantity) == (0, quantity)]
         expected = -(-lasted_ns // period_ns)
         assert len(own) == expected
-        assert all(samples[0].time_ns <= time_ns <= samples[-1].time_ns for time_ns in own)
+        for time_ns in own:
+            assert samples[0].time_ns <= time_ns <= samples[-1].time_ns
     # One request a cycle at most: the drives are read in turn.
     assert {before for _, before in bench.requests()} == {1}
 
@@ -125,9 +128,7 @@ def test_a_lost_answer_delays_nothing_and_its_object_is_read_again(bench: Bench)
     given_up = GIVEN_UP_NS // scripted.PERIOD_NS
     waited = [r for r in bench.readings if r.time_ns < samples[given_up].time_ns]
     assert waited == []
-    assert {(r.axis, r.quantity) for r in bench.readings} == {
-        (a, q) for a in (0, 1) for q in Quantity
-    }
+    assert {(r.axis, r.quantity) for r in bench.readings} == set(product((0, 1), Quantity))
 
 
 def test_no_request_goes_with_a_set_point_and_none_after_the_stop(bench: Bench) -> None:
@@ -135,7 +136,8 @@ def test_no_request_goes_with_a_set_point_and_none_after_the_stop(bench: Bench) 
     target_counts = (50_000, -40_000)
     far = Move(target_counts, (100_000, 80_000), (1_000_000, 800_000), dwell_cycles=200)
     samples = list(execute(bench.network, bench.stream, (far,), permission(), BOUNDS))
-    assert all(sample.missing == 0 for sample in samples)
+    for sample in samples:
+        assert sample.missing == 0
     assert bench.readings
     beside = [before for node, before in bench.requests() if node <= 2]
     assert beside
@@ -152,7 +154,8 @@ def test_an_object_that_a_drive_lacks_is_named_and_left_also_in_the_run(bench: B
     del bench.bus.nodes[1].objects[0x2005, 0]
     polling = bench.poll()
     assert polling.remarks == ("J2: the drive has no temperature in 2005h:00; it is not logged",)
-    assert [r.axis for r in polling.temperatures(5)] == [0]
+    axes = [r.axis for r in polling.temperatures(5)]
+    assert axes == [0]
     del bench.bus.nodes[0].objects[0x6077, 0]
     for _ in range(CYCLES):
         next(bench.stream)
@@ -235,10 +238,11 @@ def test_a_bus_without_room_is_read_before_and_after_alone(bench: Bench) -> None
         next(bench.stream)
     frames = [frame for frame in bench.bus.sent[before:] if frame.arbitration_id > 0x600]
     assert not frames
-    assert [(r.time_ns, r.axis, r.value) for r in polling.temperatures(9)] == [
+    expected = [
         (9, 0, 31.5),
         (9, 1, -4.0),
     ]
+    assert [(r.time_ns, r.axis, r.value) for r in polling.temperatures(9)] == expected
 
 
 def test_a_torque_without_rated_torque_has_no_unit_and_is_not_read(bench: Bench) -> None:

@@ -26,10 +26,10 @@ def written(bus: ScriptedBus, node_id: int) -> list[tuple[int, int]]:
         for m in bus.sent
         if m.arbitration_id == 0x600 + node_id and m.data[0] >> 5 == 1
     ]
-    return [
-        (int.from_bytes(data[1:3], "little"), int.from_bytes(data[4:8], "little"))
-        for data in requests
-    ]
+    found = []
+    for data in requests:
+        found.append((int.from_bytes(data[1:3], "little"), int.from_bytes(data[4:8], "little")))
+    return found
 
 
 @pytest.mark.parametrize(
@@ -50,8 +50,10 @@ def test_a_drive_produces_last_and_gets_its_objects_back(cob_id: int, period_us:
             ]
             bus.sent.clear()
         assert network.link.sync_producer is None
-        assert written(bus, 2)[0] == (0x1005, cob_id & ~PRODUCES)  # it falls silent first
-        assert (node.value(0x1005, 0), node.value(0x1006, 0)) == (cob_id, period_us)
+        expected = (0x1005, cob_id & ~PRODUCES)
+        assert written(bus, 2)[0] == expected  # it falls silent first
+        assert node.value(0x1005, 0) == cob_id
+        assert node.value(0x1006, 0) == period_us
 
 
 def test_a_drive_pauses_without_being_waited_for_and_starts_again() -> None:
@@ -70,7 +72,8 @@ def test_a_drive_pauses_without_being_waited_for_and_starts_again() -> None:
             assert network.link.sync_producer == "J2"  # a SYNC on its way is no foreign one
             producer.start()
             assert node.value(0x1005, 0) == 0x80 | PRODUCES
-        assert (node.value(0x1005, 0), node.value(0x1006, 0)) == (0x80, 500)
+        assert node.value(0x1005, 0) == 0x80
+        assert node.value(0x1006, 0) == 500
 
 
 def test_a_drive_that_cannot_produce_says_so_and_is_given_back() -> None:

@@ -142,31 +142,35 @@ def run(
     network, scripted = cell()
     clock = scripted.clock
     faults = list[DriverError]()
-    ends = [
-        Timeline(
-            clock,
-            delays_ns,
-            () if number else stops_ns,
-            producer,
-            (1, 2) if buses == 1 else (number + 1,),
+    ends = []
+    for number in range(buses):
+        ends.append(
+            Timeline(
+                clock,
+                delays_ns,
+                () if number else stops_ns,
+                producer,
+                (1, 2) if buses == 1 else (number + 1,),
+            )
         )
-        for number in range(buses)
-    ]
     bus: can.BusABC = ends[0]
     if buses == 2:
-        parts = [
-            BusPart(f"{n}", BusAddress("virtual", f"{n}"), frozenset((n + 1,))) for n in range(2)
-        ]
+        parts = []
+        for n in range(2):
+            node_ids = frozenset((n + 1,))
+            parts.append(BusPart(f"{n}", BusAddress("virtual", f"{n}"), node_ids))
         address = SplitAddress(tuple(parts))
         bus = SplitBus(address, ends, lambda: clock.now_ns * 1e-9)
     network.link._bus = bus
     network.link.sync_producer = "J1" if producer else None
     producer_on_timeline = ProducerOnTimeline(ends[0])
     followed = FollowedSync(PERIOD_NS, producer_on_timeline, timeout_s=0.1, clock=clock)
-    stream = SyncStream(network, followed if producer else TimedSync(PERIOD_NS, 0, clock))
+    pacing = followed if producer else TimedSync(PERIOD_NS, 0, clock)
+    stream = SyncStream(network, pacing)
     samples = [stream.advance() for _ in range(CYCLES)]
     if to_the_end:
-        stream.read_on((MAX_MISSING_CYCLES + 2) * PERIOD_NS * 1e-9, lag_s=1.0)
+        seconds = (MAX_MISSING_CYCLES + 2) * PERIOD_NS * 1e-9
+        stream.read_on(seconds, lag_s=1.0)
     found = stream.statistics
     while True:
         try:

@@ -25,18 +25,22 @@ def alarm_cycles(
 ) -> list[int]:
     """Cycles in which the first of two axes is reported; the second has no such bit."""
     profile = replace(PROFILE, toggle_bit=BIT, update_period_us=update_period_us)
-    bits = ToggleBits((Axis("J1", 1, profile, None), Axis("J2", 2, PROFILE, None)))
+    axes = (Axis("J1", 1, profile, None), Axis("J2", 2, PROFILE, None))
+    bits = ToggleBits(axes)
     found = []
     for cycle, value in enumerate(values):
         lost = int(cycle in missing)
         for axis, bit, error in bits.stale(cycle * PERIOD_NS, (value << BIT | 0x27, 0x27), lost):
-            assert (axis, error.node_id, bit) == (0, 1, BIT)
+            assert axis == 0
+            assert error.node_id == 1
+            assert bit == BIT
             found.append(cycle)
     return found
 
 
 def test_a_bit_that_is_stuck_is_reported_once_after_two_periods() -> None:
-    assert alarm_cycles([0, 1, 0, 1, 1, 1, 1, 1, 0, 1, 1, 1]) == [5, 11]
+    found = alarm_cycles([0, 1, 0, 1, 1, 1, 1, 1, 0, 1, 1, 1])
+    assert found == [5, 11]
 
 
 @settings(deadline=None)
@@ -44,7 +48,9 @@ def test_a_bit_that_is_stuck_is_reported_once_after_two_periods() -> None:
 def test_an_amplifier_that_is_slower_than_sync_is_reported_after_two_of_its_periods(
     cycles_a_refresh: int, phase: int, hangs: int
 ) -> None:
-    values = [(min(cycle, hangs) + phase) // cycles_a_refresh % 2 for cycle in range(hangs + 40)]
+    values = []
+    for cycle in range(hangs + 40):
+        values.append((min(cycle, hangs) + phase) // cycles_a_refresh % 2)
     found = alarm_cycles(values, update_period_us=1000 * cycles_a_refresh)
     assert len(found) == 1
     assert hangs < found[0] <= hangs + 2 * cycles_a_refresh
@@ -76,18 +82,21 @@ def test_only_a_bit_that_is_the_makers_own_can_be_a_toggle_bit_and_it_needs_a_so
         sourced.replace("tap:", "toggle_bit: 14\ntap:", 1).encode(), "good.yaml"
     )
     assert profile.toggle_bit == 14
-    assert {fact.about for fact in profile.facts} >= {"toggle_bit", "save"}
+    abouts = {fact.about for fact in profile.facts}
+    assert abouts >= {"toggle_bit", "save"}
 
 
 def test_the_second_axis_is_watched_while_the_first_is_missing_or_toggles() -> None:
     profile = replace(PROFILE, toggle_bit=BIT, update_period_us=1000)
     for missing in (0, 1):
-        bits = ToggleBits((Axis("J1", 1, profile), Axis("J2", 2, profile)))
+        axes = (Axis("J1", 1, profile), Axis("J2", 2, profile))
+        bits = ToggleBits(axes)
         found = []
         for cycle in range(4):
             words = (cycle % 2 << BIT, 1 << BIT)
             found.append(list(bits.stale(cycle * PERIOD_NS, words, missing)))
         (stale,) = found[2]
-        assert (stale[0], stale[1]) == (1, BIT)
+        assert stale[0] == 1
+        assert stale[1] == BIT
         assert "J2 (node 2): statusword bit 14 has not toggled for 2 cycles, 2 ms" in str(stale[2])
         assert found[0] + found[1] + found[3] == []

@@ -121,8 +121,10 @@ def test_sums_of_clusters_are_those_of_each_clusters_own_rows(
     recorded = noisy.training.system()
     system = recorded
     if has_instruments:  # other rows for J than for e
-        tilted = [[rows * 1.01 for rows in cluster] for cluster in recorded.clusters]
-        system = replace(recorded, clusters=tuple(map(tuple, tilted)))
+        tilted = []
+        for cluster in recorded.clusters:
+            tilted.append(tuple(rows * 1.01 for rows in cluster))
+        system = replace(recorded, clusters=tuple(tilted))
     estimate = noisy.estimate
     around = (estimate.gains, estimate.parameters, estimate.axis_noise)
     grams, scores = _sums_of_motors(system, recorded, *around)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cache
+from itertools import product
 
 import numpy as np
 import pytest
@@ -102,7 +103,7 @@ HEAVY = (
 """Beside these: in a chain of couplings a motor in another's place belongs to another joint,
 so that other rows count; and a heavy arm that leans is refused, not only fitted badly.
 """
-CASES = [(kind, gravity) for kind in (*KINDS, *HEAVY) for gravity in (UPRIGHT, LEANING)]
+CASES = list(product((*KINDS, *HEAVY), (UPRIGHT, LEANING)))
 
 
 def _name(value: object) -> str:

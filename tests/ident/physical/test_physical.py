@@ -213,8 +213,9 @@ def test_no_other_body_of_the_same_torque_is_nearer_to_the_prior() -> None:
         return total
 
     _, _, right = np.linalg.svd(base.grouping)
-    places = [14 * joint + place for joint in range(6) for place in range(10, 14)]
-    scalars = [*places, 84, 85, 86]
+    scalars = [84, 85, 86]
+    for joint in range(6):
+        scalars.extend(range(14 * joint + 10, 14 * joint + 14))
     rows = [row for row in right[len(base.names) :] if np.all(np.abs(row[scalars]) < 1e-9)]
     inertial = np.array(rows)
     least = distance(found.standard)
