@@ -5,6 +5,7 @@ from __future__ import annotations
 import codecs
 import re
 
+from daq.config.foreign_files import foreign_kind
 from daq.errors import ConfigurationInconsistent
 
 _MARKS = (
@@ -14,6 +15,7 @@ _MARKS = (
 )
 _DECLARED = re.compile(rb"""<\?xml[^>]*?\bencoding\s*=\s*["']([A-Za-z0-9._-]+)["']""")
 DEFAULTS = ("utf-8", "utf8")  #: The encoding of XML without a declaration
+EXCERPT_CHARACTERS = 40  #: Of a text in a message
 DECLARATION_BYTES = 1024  #: An XML declaration ends within so many bytes
 
 
@@ -30,16 +32,36 @@ def urdf_text(data: bytes, name: str) -> str:
         name: of the file, for messages.
 
     Raises:
-        ConfigurationInconsistent: the declared encoding is unknown, or the bytes are not in it.
+        ConfigurationInconsistent: the declared encoding is unknown, the bytes are not in it, or it
+            is a file of another kind.
     """
+    foreign = foreign_kind(data)
+    if foreign is not None:
+        raise ConfigurationInconsistent(
+            name, found=foreign.value, expected="a URDF", remedy=foreign.remedy
+        )
+    text = _decoded(data, name).lstrip()
+    # An empty file is left to the reader of the robot, who names the place in the cell file.
+    if text and "<" not in text:
+        raise ConfigurationInconsistent(
+            name,
+            found=f"a text that is no XML: {text.rstrip()[:EXCERPT_CHARACTERS]!r}",
+            expected="a URDF",
+            remedy="give the robot's URDF",
+        )
+    return text
+
+
+def _decoded(data: bytes, name: str) -> str:
+    """Decode a URDF by its byte order mark or its declaration."""
     encoding = _encoding_of(data)
     try:
-        return data.decode(encoding).lstrip()
+        return data.decode(encoding)
     except LookupError as error:
         raise _refused(name, f"the encoding {encoding!r}, which is not known") from error
     except UnicodeDecodeError as error:
         if encoding.lower() in DEFAULTS:
-            return data.decode("cp1252", errors="replace").lstrip()
+            return data.decode("cp1252", errors="replace")
         raise _refused(
             name, f"byte {error.start} is not in the declared encoding {encoding!r}"
         ) from error

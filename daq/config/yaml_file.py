@@ -12,6 +12,7 @@ A file that was given in the place of another is named by its kind (`DocumentKin
 
 from __future__ import annotations
 
+import codecs
 import dataclasses
 import difflib
 import json
@@ -26,6 +27,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, TypeVar, cast, get_a
 import yaml
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, ValidationInfo
 
+from daq.config.foreign_files import foreign_kind
 from daq.errors import (
     ConfigurationMissing,
     DaqError,
@@ -240,6 +242,12 @@ def parse_yaml(text: bytes, name: str) -> Document:
     other = kind_of_head(text)
     if other is not None:
         raise YamlInvalid(name, found=other.value, expected="a file in YAML", remedy=IN_ORDER)
+    foreign = foreign_kind(text)
+    if foreign is not None:
+        raise YamlInvalid(
+            name, found=foreign.value, expected="a file in YAML", remedy=foreign.remedy
+        )
+    _check_encoding(text, name)
     lines: dict[Location, int] = {}
     try:
         _check_events(text, name)
@@ -270,6 +278,26 @@ def parse_yaml(text: bytes, name: str) -> Document:
             remedy="is this the right file?",
         ) from error
     return Document(name, tree, lines)
+
+
+def _check_encoding(text: bytes, name: str) -> None:
+    """Refuse bytes that are no UTF-8, with their line; libyaml has no place for them.
+
+    Raises:
+        YamlInvalid: a byte is in another encoding. UTF-16 with its mark is left to libyaml.
+    """
+    if text.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return
+    try:
+        text.decode("utf-8")
+    except UnicodeDecodeError as error:
+        line = text.count(b"\n", 0, error.start) + 1
+        raise YamlInvalid(
+            f"{name}:{line}",
+            found=f"byte 0x{text[error.start]:02x}, which is no UTF-8 there",
+            expected="one YAML document in UTF-8",
+            remedy="save the file as UTF-8; is this the right file?",
+        ) from error
 
 
 def _check_events(text: bytes, name: str) -> None:

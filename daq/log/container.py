@@ -37,8 +37,17 @@ from mcap.records import (
 )
 from numpy.typing import NDArray
 
-from daq.config.yaml_file import IN_ORDER, kind_of_file
-from daq.errors import LogCorrupt, LogForeign, LogMissing, LogTruncated, reason_of
+from daq.config.foreign_files import HEAD_BYTES as FOREIGN_BYTES
+from daq.config.foreign_files import foreign_kind
+from daq.config.yaml_file import IN_ORDER, MAGIC_OF_LOGS, kind_of_file
+from daq.errors import (
+    LogCorrupt,
+    LogForeign,
+    LogMissing,
+    LogTruncated,
+    LogUnreadable,
+    reason_of,
+)
 from daq.files import open_regular
 from daq.log.message import (
     EVENTS_SCHEMA,
@@ -141,6 +150,8 @@ class RecordFile:
 
     def _unfinished_records(self, stream: BinaryIO, size: int) -> Iterator[PlacedRecord]:
         self._check_start(stream, size)
+        if size < len(MAGIC):
+            raise self._truncated(size, None)
         crc = zlib.crc32(MAGIC)
         self.whole_bytes = stream.seek(len(MAGIC))
         while True:
@@ -230,21 +241,46 @@ class RecordFile:
 
     def _check_start(self, stream: BinaryIO, size: int) -> None:
         start = stream.read(len(MAGIC))
-        if start != MAGIC[: len(start)] or (size < len(MAGIC) and size > 0):
+        if 0 < size < len(MAGIC) and MAGIC.startswith(start):
+            raise self._truncated(size, None)
+        if not MAGIC.startswith(start):
             is_text = all(byte in b"\t\n\r" or 0x20 <= byte < 0x7F for byte in start)
+            remedy = f"is this the right file? {IN_ORDER}"
             kind = kind_of_file(self.path)
-            if kind is not None:
+            foreign = foreign_kind(start + stream.read(FOREIGN_BYTES))
+            if start.startswith(MAGIC_OF_LOGS):
+                raise self._other_mark(start)
+            if foreign is not None:
+                found = foreign.value
+                remedy = foreign.remedy
+            elif kind is not None:
                 found = kind.value
             elif is_text:
                 found = f"a text file that begins with {start.decode()!r}"
             else:
                 found = f"first bytes {start!r}"
-            raise LogForeign(
-                str(self.path),
-                found=found,
-                expected="a log (MCAP)",
-                remedy=f"is this the right file? {IN_ORDER}",
+            raise LogForeign(str(self.path), found=found, expected="a log (MCAP)", remedy=remedy)
+
+    def _other_mark(self, start: bytes) -> LogUnreadable:
+        """Make the error for an MCAP file with another opening mark than ours.
+
+        The mark ends in a carriage return and a line feed, so that a copy in text mode shows.
+        """
+        version = start[len(MAGIC_OF_LOGS) : len(MAGIC_OF_LOGS) + 1]
+        if version == MAGIC[len(MAGIC_OF_LOGS) : len(MAGIC_OF_LOGS) + 1]:
+            return LogCorrupt(
+                f"{self.path}, byte 0",
+                found=f"an opening mark of {start!r}",
+                expected=f"{MAGIC!r}",
+                remedy="its line ends were converted, or it was damaged: copy it again from where "
+                "it was recorded, as a binary file",
             )
+        return LogForeign(
+            str(self.path),
+            found=f"MCAP of version {version!r}",
+            expected="a log (MCAP of version 0)",
+            remedy="convert the file with a tool for MCAP",
+        )
 
     def _check_end(self, stream: BinaryIO, size: int) -> None:
         stream.seek(max(0, size - len(MAGIC)))
@@ -266,9 +302,13 @@ class RecordFile:
         # would pass for data.
         if stored == 0 or stored != computed:
             if stored == 0:
-                found = "no checksum"
-            else:
-                found = f"checksum {stored:#010x} and contents of {computed:#010x}"
+                raise LogCorrupt(
+                    f"{self.path}, byte {offset}",
+                    found=f"{what} with no checksum",
+                    expected="contents that match their checksum",
+                    remedy="another tool may have written or cut the log: take the original",
+                )
+            found = f"checksum {stored:#010x} and contents of {computed:#010x}"
             raise self.corrupt(offset, f"{what} with {found}", "contents that match their checksum")
 
     def corrupt(self, offset: int, found: str, expected: str) -> LogCorrupt:

@@ -20,6 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
+from daq.config.foreign_files import foreign_kind
 from daq.config.import_description import Column, CsvLayout, ImportDescription, TimeColumn
 from daq.errors import TableUnfit, counted
 from daq.files import read_regular
@@ -31,6 +32,8 @@ LARGEST_BYTES = 2**30  #: Largest file; an hour of six axes at 1 kHz has half of
 LARGEST_JUMP = 3.0
 COMMENT_SIGNS = ("#", "%", "//")  #: Of lines before and after the rows
 EXCERPT_CHARACTERS = 40  #: Characters of a line in a message
+#: Usual delimiters, and how YAML has them
+DELIMITERS = {",": '","', ";": '";"', "\t": r'"\t"', "|": '"|"', " ": '" "'}
 MINUS = "\u2212"  #: The minus sign of typography, which spreadsheets write
 MISSING = frozenset(("", "nan", "+nan", "-nan", "inf", "+inf", "-inf", "na", "n/a", "null", "none"))
 """Words for a number that is not there, in lower case: a line with them is a row."""
@@ -87,12 +90,27 @@ class CsvLines:
             )
         if self.names.count(column) == 1:
             return self.names.index(column)
+        remedy = "correct `columns` in the import description"
+        other = self._other_delimiter(column)
+        if other:
+            remedy = f"write `delimiter: {other}` under `table` of the import description"
         raise TableUnfit(
             str(self.path),
             found=f"columns {', '.join(self.names)}",
             expected=f"one column {column!r}",
-            remedy="correct `columns` in the import description",
+            remedy=remedy,
         )
+
+    def _other_delimiter(self, column: str) -> str:
+        """Return the delimiter, as YAML has it, that a header of one field is split by;
+        empty where none gives the column.
+        """
+        if len(self.names) != 1:
+            return ""
+        for delimiter, as_yaml in DELIMITERS.items():
+            if column in split_fields(self.names[0], delimiter):
+                return as_yaml
+        return ""
 
     def select_rows(self, rows: slice) -> CsvLines:
         """Return some of the rows."""
@@ -206,8 +224,11 @@ def read_lines(
 def _without_rows(file: _RawLines, start: int, rows: int, wanted: ImportDescription) -> TableUnfit:
     """Make the error for a file without rows, or without those that are kept."""
     lines = len(file.lines)
-    found = f"{lines} lines, of which {min(start, lines)} before the numbers"
-    remedy = "was the export interrupted?"
+    before = min(start, lines)
+    found = f"{counted(lines, 'line')}, {before} of them before the numbers"
+    if before:
+        found += f": {file.excerpt(before - 1)}"
+    remedy = "is this the file with the rows, and was its export finished?"
     if rows and wanted.keep is not None:
         found = f"{counted(rows, 'row')} of numbers, none of them in `keep`"
         remedy = "correct `keep` in the import description"
@@ -448,8 +469,12 @@ def _decode(path: Path, data: bytes) -> tuple[str, ...]:
     """Return the text, and a remark if it is not UTF-8.
 
     Raises:
-        TableUnfit: it is no text, with the place of the first byte that shows it.
+        TableUnfit: it is no text, with the place of the first byte that shows it, or the name of
+            its kind.
     """
+    other = foreign_kind(data)
+    if other is not None:
+        raise TableUnfit(str(path), found=other.value, expected="a CSV file", remedy=other.remedy)
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return _decode_utf16(path, data)
     mark = codecs.BOM_UTF8 if data.startswith(codecs.BOM_UTF8) else b""
@@ -461,6 +486,14 @@ def _decode(path: Path, data: bytes) -> tuple[str, ...]:
             raise _no_text(path, len(mark) + error.start, "no UTF-8") from error
         return text, "no UTF-8; read as Windows-1252"
     nul = data.find(b"\0")
+    if nul >= 0 and not data[nul:].strip(b"\0"):
+        raise TableUnfit(
+            str(path),
+            found=f"nothing but NUL from byte {nul} to the end",
+            expected="rows of numbers to the last line",
+            remedy="the computer that wrote it lost power, or the disk was full: copy or export "
+            f"it again, or cut the file there (`head -c {nul}`)",
+        )
     if nul >= 0:
         raise _no_text(path, nul, "NUL")
     return (text,)

@@ -200,7 +200,7 @@ def _texts_ns(
         one_ns = read(text)
         if one_ns is None:
             place = f"{file.row_place(number)}, column {time.column}"
-            raise TableUnfit(place, found=repr(text), expected=expected, remedy=remedy)
+            raise TableUnfit(place, found=f"{text!r:.60}", expected=expected, remedy=remedy)
         stamp_ns.append(one_ns)
     return stamp_ns
 
@@ -276,7 +276,7 @@ def _numbers(file: CsvLines, columns: Sequence[Column]) -> FloatArray:
         remedy = _remedy(file, number, text, values)
         raise TableUnfit(
             file.field_place(number, index),
-            found=repr(text),
+            found=f"{text!r:.60}",
             expected="a finite number",
             remedy=remedy,
         )
@@ -301,7 +301,7 @@ def _check_points(file: CsvLines, indices: list[int]) -> None:
                 place = file.field_place(number, index)
                 raise TableUnfit(
                     place,
-                    found=f"{fields[index]!r}, with a point",
+                    found=f"{fields[index]!r:.60}, with a point",
                     expected="a number with a decimal comma alone, as `table` of the import "
                     "description has it",
                     remedy="if points group thousands, export the numbers without them; if they "

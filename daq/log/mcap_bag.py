@@ -230,17 +230,19 @@ def foreign_recording(path: Path) -> LogForeign | None:
     """
     bag = McapBag(path)
     joints: tuple[str, ...] = ()
+    is_finished = False
     with suppress(LogUnreadable, ValueError), closing(bag.unfinished_messages()) as messages:
         for message in islice(messages, EXAMINED):
             if message.topic.has_joint_states:
                 joints = joints or joint_state_from_cdr(unpack_message(message.data)).names
+        is_finished = True
     topics = {topic.name: topic.has_joint_states for topic in bag.topics.values()}
     if SAMPLES_TOPIC in topics:
         return None
     if not topics:
         if bag.has_entries:
             return None
-        return _foreign_beginning(path, bag.library)
+        return _without_message(path, bag.library, is_finished=is_finished)
     states = [topic for topic, has in topics.items() if has]
     library = bag.library or "another program"
     content = ", ".join(topics)
@@ -261,12 +263,24 @@ def foreign_recording(path: Path) -> LogForeign | None:
 OWN_LIBRARY = "drivegain"  #: Begin of the library's name in logs of ours
 
 
-def _foreign_beginning(path: Path, library: str) -> LogForeign | None:
-    """Return the error for a file that ends before its first message,
-    if another library began it.
+def _without_message(path: Path, library: str, *, is_finished: bool) -> LogForeign | None:
+    """Return the error for a file without a message, if another library began it.
+
+    Args:
+        path: of the file.
+        library: that wrote its header.
+        is_finished: whether its data section has an end, so that nothing is missing.
     """
     if not library or library.startswith(OWN_LIBRARY):
         return None
+    if is_finished:
+        return LogForeign(
+            str(path),
+            found=f"a bag of {library} without a message",
+            expected="a log of drivegain",
+            remedy="was the right topic recorded? `drivegain import` reads bags with "
+            f"{JOINTS_SCHEMA}",
+        )
     return LogForeign(
         str(path),
         found=f"the begin of a bag of {library}, without a whole message",

@@ -104,3 +104,9 @@ def test_the_advice_is_about_the_urdf(
     assert expected in caught.value.expected
     assert "hold" not in caught.value.expected
     assert "the URDF that it names" in caught.value.remedy
+
+
+def test_a_text_that_is_no_xml_is_refused_by_its_begin() -> None:
+    """The reader of `ident` took a short one for the name of a file, and gave advice in Python."""
+    with pytest.raises(ConfigurationInconsistent, match=r"no XML: 'hello'.*give the robot's URDF"):
+        urdf_text(b"hello\n", "arm.urdf")

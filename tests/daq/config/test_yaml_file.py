@@ -256,3 +256,10 @@ def test_every_other_integer_is_what_was_written(value: int) -> None:
     text = f"a: {written}".encode()
     tree = parse_yaml(text, "x").tree
     assert tree == {"a": value}
+
+
+def test_bytes_of_another_encoding_are_named_with_their_line() -> None:
+    """It was the name of a class of the parser, without a line."""
+    text = "name: press\n# für die Zelle 4\n".encode("latin-1")
+    with pytest.raises(YamlInvalid, match=r"cell\.yaml:2: found byte 0xfc.*save the file as UTF-8"):
+        parse_yaml(text, "cell.yaml")

@@ -4,6 +4,7 @@ and rows that are cut off.
 
 from __future__ import annotations
 
+import gzip
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ from daq.config.import_description import (
     VelocityColumns,
     VelocityUnit,
 )
+from daq.config.yaml_file import parse_yaml
 from daq.errors import TableUnfit
 from daq.log.csv_table import read_csv
 from daq.log.table import Table
@@ -513,3 +515,59 @@ def test_a_part_with_nothing_in_it_is_refused(tmp_path: Path, part: KeptPart) ->
         r"`keep`.*correct `keep`",
     ):
         _read(tmp_path, lines, keep=part)
+
+
+@pytest.mark.parametrize(
+    ("delimiter", "as_yaml"), [(";", '";"'), ("\t", r'"\t"'), ("  ", '" "'), ("|", '"|"')]
+)
+def test_a_header_with_another_delimiter_names_the_setting_that_reads_it(
+    tmp_path: Path, delimiter: str, as_yaml: str
+) -> None:
+    """The advice was to correct the columns."""
+    lines = [delimiter.join(line) for line in (("t", "q", "i"), ("0", "1", "2"), ("1", "2", "3"))]
+    with pytest.raises(TableUnfit) as refused:
+        _read(tmp_path, lines)
+    assert refused.value.remedy.startswith(f"write `delimiter: {as_yaml}` under `table`")
+    layout = parse_yaml(f"delimiter: {as_yaml}".encode(), "layout").tree
+    table = _read(tmp_path, [*lines, delimiter.join(("2", "3", "4"))], **layout)
+    assert table.values[:, 0].tolist() == [1.0, 2.0, 3.0]
+
+
+def test_a_file_without_rows_shows_the_line_that_was_taken_for_the_header(tmp_path: Path) -> None:
+    with pytest.raises(TableUnfit, match="1 line, 1 of them before the numbers: '<!doctype html>'"):
+        _read(tmp_path, ["<!doctype html>"])
+
+
+def test_a_tail_of_nul_is_a_loss_of_power_and_names_the_cut(tmp_path: Path) -> None:
+    """The advice was to save the file as UTF-8."""
+    lines = ["t,q,i", "0,1,2", "1,2,3", "2,3,4"]
+    with pytest.raises(TableUnfit) as refused:
+        _read(tmp_path, lines, end="\n" + "\0" * 512)
+    length = len("\n".join(lines)) + 1
+    assert refused.value.found == f"nothing but NUL from byte {length} to the end"
+    assert f"head -c {length}" in refused.value.remedy
+    kept = (tmp_path / "run.csv").read_bytes()[:length].decode()
+    table = _read(tmp_path, kept.splitlines())
+    assert len(table.values) == 3
+
+
+def test_a_packed_file_is_no_text_in_another_encoding(tmp_path: Path) -> None:
+    packed = gzip.compress(b"t,q,i\n0,1,2\n1,2,3\n2,3,4\n")
+    (tmp_path / "packed").write_bytes(packed)
+    wanted = ImportDescription(
+        name="run",
+        cell="cell.yaml",
+        position=PositionColumns(
+            file="packed", columns=("q",), unit=PositionUnit.RAD, side=Side.JOINT
+        ),
+        current=CurrentColumns(file="packed", columns=("i",), unit="A"),
+        rate_hz=100.0,
+    )
+    with pytest.raises(TableUnfit, match=r"packed by gzip.*gunzip"):
+        read_csv(tmp_path / "packed", wanted, ("q", "i"), None)
+
+
+def test_a_long_field_is_cut_in_the_message(tmp_path: Path) -> None:
+    with pytest.raises(TableUnfit) as refused:
+        _read(tmp_path, ["t,q,i", "0,1,2", "1," + "x" * 5000 + ",3", "2,3,4"])
+    assert len(refused.value.found) <= 60

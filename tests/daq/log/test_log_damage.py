@@ -196,3 +196,44 @@ def test_a_log_packed_anew_by_another_tool_is_the_same(good: Path, tmp_path: Pat
             )
         writer.finish()
     assert _same(read_log(path), read_log(good))
+
+
+def test_a_log_with_converted_line_ends_is_damaged_and_no_other_file(
+    good: Path, tmp_path: Path
+) -> None:
+    """It was "found a log (MCAP); expected a log (MCAP)"."""
+    path = tmp_path / "text-mode.mcap"
+    path.write_bytes(good.read_bytes().replace(b"\r\n", b"\n"))
+    with pytest.raises(LogCorrupt, match="line ends were converted"):
+        read_log(path)
+
+
+def test_another_version_of_mcap_is_named(good: Path, tmp_path: Path) -> None:
+    path = tmp_path / "later.mcap"
+    path.write_bytes(good.read_bytes().replace(b"\x89MCAP0", b"\x89MCAP1", 1))
+    with pytest.raises(LogForeign, match="MCAP of version b'1'"):
+        read_log(path)
+
+
+def test_a_log_without_a_checksum_was_written_by_another_tool(good: Path, tmp_path: Path) -> None:
+    """Its bytes are as that tool wrote them: to copy the file again does not help."""
+    data = bytearray(good.read_bytes())
+    end = data.rindex(bytes([Opcode.DATA_END]) + struct.pack("<Q", 4))
+    data[end + 9 : end + 13] = bytes(4)
+    path = tmp_path / "no-checksum.mcap"
+    path.write_bytes(data)
+    with pytest.raises(LogCorrupt, match=r"with no checksum.*another tool.*take the original"):
+        read_log(path)
+
+
+def test_a_bag_of_another_program_without_a_message_is_no_incomplete_copy(tmp_path: Path) -> None:
+    path = tmp_path / "bag.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start(profile="ros2", library="rosbag2")
+        writer.finish()
+    with pytest.raises(LogForeign, match="a bag of rosbag2 without a message"):
+        read_log(path)
+    path.write_bytes(path.read_bytes()[:40])
+    with pytest.raises(LogForeign, match="the copy is incomplete"):
+        read_log(path)

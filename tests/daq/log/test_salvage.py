@@ -409,3 +409,12 @@ def test_a_salvage_that_cannot_write_does_not_ask_for_a_recording(
     with pytest.raises(OutputFailed, match="nothing was written") as caught:
         salvage(part, saved_path)
     assert "record again" not in str(caught.value)
+
+
+def test_an_empty_file_is_called_empty(tmp_path: Path) -> None:
+    """It was "8 bytes, whole records up to 8"."""
+    damaged = tmp_path / "run.mcap.part"
+    damaged.write_bytes(b"")
+    with pytest.raises(LogUnreadable, match=r"found 0 bytes .*no samples"):
+        salvage(damaged, tmp_path / "saved.mcap")
+    assert not (tmp_path / "saved.mcap").exists()
