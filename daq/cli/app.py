@@ -42,6 +42,7 @@ CLICK_ERROR: type[Exception] = next(
 """What typer raises of a command line that cannot be parsed:
 it brings a click of its own, without public names.
 """
+MISSING = "MissingParameter"  #: What its error is called where an argument or option is not given
 BY_JOB = {
     Job.COMMISSION: (
         Verb(
@@ -427,6 +428,13 @@ def _verb_of(words: list[str]) -> str:
     return next((word for word in words if word in VERB_NAMES), "")
 
 
+def _wanted(shown: str, param: Any) -> str:
+    """Return what a missing argument or option is, as the help of its verb says it."""
+    if not param.help:
+        return shown
+    return f"{shown} ({param.help.rstrip('.')})"
+
+
 def _usage_failed(error: Any, words: list[str], json_wanted: bool) -> int:
     """Report a command line that cannot be parsed."""
     if "Usage:" in error.message:
@@ -448,6 +456,8 @@ def _usage_failed(error: Any, words: list[str], json_wanted: bool) -> int:
         else:
             shown = max(param.opts, key=len)
         found = found.replace(f"'{param.display_name_raw}'", f"'{shown}'", 1)
+        if type(error).__name__ == MISSING:
+            usage = _wanted(shown, param)
     remedy = f"`{command} --help` explains it"
     # A value of the wrong type: the message of typer's validation does not repeat it.
     given = [one["input"] for one in getattr(error.__cause__, "errors", list)()]

@@ -106,8 +106,11 @@ def import_files(
     description: Annotated[
         Path, typer.Argument(help="Import description (YAML): columns, units, rate.")
     ],
-    data: Annotated[Path, typer.Option("--data", help="Folder of the files.")],
     out: NewLogOption,
+    data: Annotated[
+        Path | None,
+        typer.Option("--data", help="Folder of the files; the description's when left out."),
+    ] = None,
     cell: Annotated[
         Path | None, typer.Option("--cell", help="Another cell file than the description's.")
     ] = None,
@@ -125,8 +128,9 @@ def import_files(
     from daq.log.importing import import_recording
     from daq.report.log import import_report, timing_text
 
+    folder = data or description.parent
     imported = import_recording(
-        description, data, out, software=software(), cell_path=cell, holdout=holdout
+        description, folder, out, software=software(), cell_path=cell, holdout=holdout
     )
     WRITTEN.append(out)
     statistics = imported.statistics

@@ -170,6 +170,23 @@ def test_an_option_without_its_value_is_an_error_of_the_usual_form(
                 assert failure["do"] == expected
 
 
+@pytest.mark.parametrize(
+    ("words", "missing", "wanted"),
+    [
+        (["weigh"], "argument 'CALIBRATION'", "calibration.yaml written by `drivegain fit`"),
+        (["import", "press-4.yaml"], "option '--out'", "Log to write (.mcap); must not exist"),
+    ],
+)
+def test_what_is_missing_is_said_as_the_help_says_it(
+    capsys: pytest.CaptureFixture[str], words: list[str], missing: str, wanted: str
+) -> None:
+    assert main(words) == ExitCode.USAGE
+    said = capsys.readouterr().err
+    assert f"Missing {missing}" in said
+    name = missing.split("'")[1]
+    assert f"expected: {name} ({wanted})" in said
+
+
 def test_a_value_of_the_wrong_type_is_shown(capsys: pytest.CaptureFixture[str]) -> None:
     record = ["record", "cell.yaml", "plan.yaml", "--out", "a.mcap", "--mass"]
     assert main([*record, "4,59"]) == ExitCode.USAGE

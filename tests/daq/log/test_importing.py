@@ -120,6 +120,13 @@ def bench(checkout: Path, tmp_path: Path) -> Bench:
     return Bench(checkout, tmp_path).prepare()
 
 
+def test_the_files_are_beside_the_description_where_no_folder_is_named(bench: Bench) -> None:
+    beside = bench.description.parent / "run.csv"
+    beside.write_bytes((bench.data / "run.csv").read_bytes())
+    assert main(["import", str(bench.description), "--out", str(bench.out)]) == ExitCode.OK
+    assert bench.left == [bench.out.name]
+
+
 def test_joint_degrees_come_back_as_radians(bench: Bench) -> None:
     assert bench.run() == 0
     run, cell = load_run(bench.out)
