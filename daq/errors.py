@@ -328,6 +328,9 @@ class OutputFailed(DaqError):
                 "or `usermod -aG` and a new login), or give the file to this user (`chown`, "
                 "`chgrp`) if the controller can read it then",
             )
+        missing = cls.of_missing_folder(path, error)
+        if missing is not None:
+            return missing
         if error.errno == errno.ENAMETOOLONG:
             return cls(
                 str(path),
@@ -341,6 +344,19 @@ class OutputFailed(DaqError):
             found=reason_of(error),
             expected="a folder that can be written, with room",
             remedy="it is as it was; free space or rights, or choose another folder",
+        )
+
+    @classmethod
+    def of_missing_folder(cls, path: Path, error: OSError) -> OutputFailed | None:
+        """Make the error for a file whose folder is not there; None for another reason."""
+        is_missing = error.errno in {errno.ENOENT, errno.ENOTDIR}
+        if not is_missing or path.parent.is_dir():
+            return None
+        return cls(
+            str(path),
+            found=f"no folder {path.parent}",
+            expected="a folder that is there",
+            remedy="nothing was written; make it (`mkdir -p`), or choose another folder",
         )
 
 

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import sys
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
@@ -99,6 +100,11 @@ class CsvLayout:
     def _check_delimiter(self) -> CsvLayout:
         if self.delimiter == self.decimal:
             raise ValueError("a delimiter that is not the decimal sign")
+        delimiter = self.delimiter
+        is_of_text = delimiter.isalnum() or delimiter in "\"'+-._"
+        is_control = not delimiter.isprintable() and delimiter != "\t"
+        if is_of_text or is_control:
+            raise ValueError("a delimiter that no number or name has, as , ; | or a tab")
         first = "#" if self.comment is None else self.comment[0]
         if first in "+-.," or first.isspace() or first.isdigit():
             raise ValueError("a comment that begins as no number does, as #")
@@ -359,6 +365,9 @@ def load_import(path: Path) -> ImportDescription:
     if wanted.position.unit is PositionUnit.COUNTS and wanted.position.side is Side.JOINT:
         expected = "motor; counts are of the motor encoder"
         faults.append(Fault(("position", "side"), "joint, with encoder counts", expected))
+    if wanted.mounting is not None and wanted.payload is None:
+        expected = "`payload` with it, or neither"
+        faults.append(Fault(("mounting",), f"{wanted.mounting!r} without `payload`", expected))
     axes = len(wanted.position.places)
     for name, section in wanted.sections():
         factors = section.stated_factors if isinstance(section, ScaledColumns) else ()
@@ -369,6 +378,11 @@ def load_import(path: Path) -> ImportDescription:
             faults.append(Fault((name, "factor"), f"{min(factors, key=abs):g}", expected))
         # One name may be a whole matrix or field (daq.log.importing.with_columns); then the import
         # counts.
+        reversed_axes = Counter(getattr(section, "reversed", ()))
+        repeated = [axis for axis, count in reversed_axes.items() if count > 1]
+        if repeated:
+            found = f"{', '.join(repeated)} more than once"
+            faults.append(Fault((name, "reversed"), found, "each axis once"))
         own = len(section.places)
         if own != axes and 1 not in {axes, own}:
             found = f"{own} columns"

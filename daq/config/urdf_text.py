@@ -15,7 +15,7 @@ _MARKS = (
 )
 _DECLARED = re.compile(rb"""<\?xml[^>]*?\bencoding\s*=\s*["']([A-Za-z0-9._-]+)["']""")
 DEFAULTS = ("utf-8", "utf8")  #: The encoding of XML without a declaration
-EXCERPT_CHARACTERS = 40  #: Of a text in a message
+LONGEST_NAME = 200  #: Characters of a line that may be the name of a file
 DECLARATION_BYTES = 1024  #: An XML declaration ends within so many bytes
 
 
@@ -41,13 +41,14 @@ def urdf_text(data: bytes, name: str) -> str:
             name, found=foreign.value, expected="a URDF", remedy=foreign.remedy
         )
     text = _decoded(data, name).lstrip()
-    # An empty file is left to the reader of the robot, who names the place in the cell file.
-    if text and "<" not in text:
+    # A checkout that makes files of symbolic links leaves one line, the name of the real file.
+    is_name = 0 < len(text) <= LONGEST_NAME and "\n" not in text.rstrip() and "<" not in text
+    if is_name:
         raise ConfigurationInconsistent(
             name,
-            found=f"a text that is no XML: {text.rstrip()[:EXCERPT_CHARACTERS]!r}",
+            found=f"one line of text, {text.rstrip()!r}",
             expected="a URDF",
-            remedy="give the robot's URDF",
+            remedy="give the robot's URDF, not a file with its name",
         )
     return text
 

@@ -450,14 +450,15 @@ def read_model(document: Document, model: type[Model], folder: Path | None = Non
                 remedy=f"{IN_ORDER} (CELL comes first){page}",
             ) from error
         items = error.errors(include_url=False)
-        faults = [_fault(item, model) for item in items[:MAX_EXPLAINED]]
+        found_faults = [_fault(item, model, document.tree) for item in items[:MAX_EXPLAINED]]
+        faults = _joined_faults(found_faults)
         # A list counts as empty when its items are wrong; the faults inside say enough.
         outer = set[Location]()
         for fault in faults:
             outer.update(fault.path[:length] for length in range(len(fault.path)))
         remedy = f"correct the file{page}"
-        if len(items) > len(faults):
-            remedy += f" ({len(items) - len(faults)} more faults are not listed)"
+        if len(items) > MAX_EXPLAINED:
+            remedy += f" ({len(items) - MAX_EXPLAINED} more faults are not listed)"
         inner = [fault for fault in faults if fault.path not in outer]
         raise SchemaMismatch(**fault_texts(document, inner), remedy=remedy) from error
 
@@ -552,9 +553,42 @@ def _convert(
     return value
 
 
-def _fault(item: Any, model: type[BaseModel]) -> Fault:
+def _joined_faults(faults: list[Fault]) -> list[Fault]:
+    """Join the faults of one value that may be of several kinds, none of which it is."""
+    joined: dict[tuple[Location, str], list[str]] = {}
+    for fault in faults:
+        expected = joined.setdefault((fault.path, fault.found), [])
+        if fault.expected not in expected:
+            expected.append(fault.expected)
+    return [
+        Fault(path, found, ", or ".join(expected)) for (path, found), expected in joined.items()
+    ]
+
+
+def _path_in_file(item: Any, tree: Any) -> Location:
+    """Return where in the file a validation error is.
+
+    Where a value may be of several kinds, pydantic's path has a name for each of them; that is no
+    part of the file.
+    """
+    path: list[str | int] = []
+    here = tree
+    parts = [part for part in item["loc"] if not str(part).startswith(_NOT_IN_FILE)]
+    for place, part in enumerate(parts):
+        is_last = place == len(parts) - 1
+        is_key = isinstance(here, dict) and part in here
+        is_index = isinstance(here, list) and isinstance(part, int) and part < len(here)
+        if is_key or is_index:
+            here = here[part]
+        elif not (is_last and item["type"] == "missing"):
+            continue
+        path.append(part)
+    return tuple(path)
+
+
+def _fault(item: Any, model: type[BaseModel], tree: Any) -> Fault:
     """Translate a validation error of pydantic to found and expected."""
-    path: Location = tuple(part for part in item["loc"] if not str(part).startswith(_NOT_IN_FILE))
+    path = _path_in_file(item, tree)
     if item["type"] in {"extra_forbidden", "unexpected_keyword_argument"}:
         known = _known_keys(model, path[:-1])
         near = difflib.get_close_matches(str(path[-1]), known, n=1, cutoff=0.5)

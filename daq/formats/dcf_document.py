@@ -216,7 +216,7 @@ class DcfDocument(ControllerDocument):
         if kind in _REALS:
             if not DECIMAL.fullmatch(entry.value):
                 raise self.unfit(key, f"{where} in a real object", "write a plain decimal number")
-            return Scalar(key, float(entry.value), entry.value, entry.start, entry.line)
+            return self.decimal_scalar(key, entry.value, entry.start, entry.line)
         if kind not in _INTEGERS:
             raise self.unfit(
                 key,
@@ -225,7 +225,8 @@ class DcfDocument(ControllerDocument):
             )
         style = self._style(entries, key, kind)
         try:
-            value = style.read(entry.value)
+            # By its type: a limit of the file does not make a signed object unsigned.
+            value = _style_of_type(kind).read_within(entry.value)
         except ValueError as error:
             raise self.unfit(
                 key, where, "write a plain integer, decimal or 0x", "an integer of its type"
@@ -244,20 +245,16 @@ class DcfDocument(ControllerDocument):
 
     def _style(self, entries: dict[str, DcfEntry], key: str, kind: int) -> IntegerStyle:
         """Return the integers of a type within the limits of the file."""
-        bits, signed = _INTEGERS[kind]
-        lowest = 0
-        highest = (1 << bits) - 1
-        if signed:
-            highest >>= 1
-            lowest = -highest - 1
-        style = IntegerStyle(bits, lowest, highest)
+        style = _style_of_type(kind)
+        lowest = style.lowest
+        highest = style.highest
         low_limit = self._limit(entries, key, "lowlimit", style)
         if low_limit is not None:
             lowest = max(lowest, low_limit)
         high_limit = self._limit(entries, key, "highlimit", style)
         if high_limit is not None:
             highest = min(highest, high_limit)
-        return IntegerStyle(bits, lowest, highest)
+        return IntegerStyle(style.bits, lowest, highest)
 
     def _limit(
         self, entries: dict[str, DcfEntry], key: str, name: str, style: IntegerStyle
@@ -304,7 +301,6 @@ def dcf_document(content: bytes, name: str) -> DcfDocument:
 
 _LINE = re.compile(r"([^\r\n]*)(?:\r\n|\r|\n|\Z)")
 _SECTION = re.compile(r"\s*\[([^\]]*)\]\s*")
-_ENTRY = re.compile(r"\s*([^=]*?)\s*=\s*(.*?)\s*")
 _BYTE_ORDER_MARK = "ï»¿"  #: That of UTF-8, each byte a character
 
 
@@ -339,14 +335,26 @@ def sections_of(text: str) -> list[DcfSection]:
         if written.lstrip().startswith(";"):
             continue
         title = _SECTION.fullmatch(written)
-        entry = _ENTRY.fullmatch(written)
+        # No regular expression: it would try each blank of a long line as the end of the name.
+        name, equals, value = written.partition("=")
         if title is not None:
             sections.append(DcfSection(title[1].strip().lower(), number))
-        elif entry is not None and sections:
-            start = line.end(1) - len(written) + entry.start(2)
-            parsed = DcfEntry(entry[1].lower(), entry[2], start, number)
+        elif equals and sections:
+            start = line.end(1) - len(value.lstrip())
+            parsed = DcfEntry(name.strip().lower(), value.strip(), start, number)
             sections[-1].entries.append(parsed)
     return sections
+
+
+def _style_of_type(kind: int) -> IntegerStyle:
+    """Return the integers of a type, which is one of _INTEGERS."""
+    bits, signed = _INTEGERS[kind]
+    lowest = 0
+    highest = (1 << bits) - 1
+    if signed:
+        highest >>= 1
+        lowest = -highest - 1
+    return IntegerStyle(bits, lowest, highest)
 
 
 def _object_of(section: DcfSection) -> tuple[int, int] | None:

@@ -104,7 +104,7 @@ class JsonDocument(ControllerDocument):
         token = tokens.get(path)
         if token is not None and token.kind == "number":
             line = self.text.count("\n", 0, token.start) + 1
-            return Scalar(key, float(token.text), token.text, token.start, line)
+            return self.decimal_scalar(key, token.text, token.start, line)
         if token is not None:
             raise self.unfit(key, f"{token.text:.60}", "write a plain number, without quotes")
         if _is_container(tokens, path):

@@ -51,6 +51,17 @@ class IntegerStyle:
             raise ValueError(text)
         return value
 
+    def read_within(self, text: str) -> int:
+        """Parse an integer from the lowest to the highest value.
+
+        Raises:
+            ValueError: as `read`, or it is none of these.
+        """
+        value = self.read(text)
+        if not self.lowest <= value <= self.highest:
+            raise ValueError(text)
+        return value
+
     def spell(self, value: int, like: str) -> str:
         """Format an integer; in hexadecimal where `like` is,
         with at least as many digits and in the same case.
@@ -247,6 +258,18 @@ class ControllerDocument(ABC):
         place = f"{self.name}: {key}"
         remedy = f"{remedy}; nothing was written"
         return ControllerUnfit(place, found=found, expected=expected, remedy=remedy)
+
+    def decimal_scalar(self, key: str, text: str, start: int, line: int) -> Scalar:
+        """Return a decimal number of the text.
+
+        Raises:
+            ControllerUnfit: it is beyond the numbers that a computer holds (1e400).
+        """
+        value = float(text)
+        if not math.isfinite(value):
+            found = f"line {line}: {text:.60}, beyond every number of a computer"
+            raise self.unfit(key, found, "correct the number")
+        return Scalar(key, value, text, start, line)
 
     def path_of(self, key: str) -> KeyPath:
         """Return the path of a key's number among the values;

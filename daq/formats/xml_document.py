@@ -160,11 +160,11 @@ class XmlDocument(ControllerDocument):
                 key,
                 f"line {element.line}: {written!r:.60}",
                 "write a plain decimal number there, without entities, CDATA, comments or other "
-                "other elements next to it",
+                "elements next to it",
             )
         start += written.index(number)
         line = self.text.count("\n", 0, start) + 1
-        return Scalar(key, float(number), number, start, line)
+        return self.decimal_scalar(key, number, start, line)
 
     def _find(self, around: Element, key: str) -> tuple[Element, str | None]:
         """Return the element that a path names, and its attribute where it names one."""

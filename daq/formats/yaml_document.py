@@ -103,7 +103,7 @@ class YamlDocument(ControllerDocument):
                 key, f"the tag {tags[0]:.60} before it", "remove the tag, or make it !!float"
             )
         line = node.start_mark.line + 1
-        return Scalar(key, float(node.value), node.value, start, line)
+        return self.decimal_scalar(key, node.value, start, line)
 
     def _child(self, node: Node, step: str, key: str, walked: KeyPath) -> Node:
         place = ".".join(walked) or "the file"

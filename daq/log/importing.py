@@ -8,6 +8,7 @@ count).
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from math import ceil, log2, pi
@@ -114,6 +115,13 @@ def import_recording(
     """
     wanted = load_import(description)
     _require_name_of_holdout(wanted, holdout)
+    if holdout is not None and os.path.realpath(holdout) == os.path.realpath(out):
+        raise UsageError(
+            str(holdout),
+            found="one name for both logs",
+            expected="a name for each of them",
+            remedy="give `--holdout` another name than `--out`",
+        )
     path = cell_path or description.parent / wanted.cell
     cell = load_cell(path)
     wanted = with_columns(wanted, data, cell.axis_names)

@@ -390,6 +390,9 @@ class LogWriter:
                 self._missing[axis] += sample.missing >> axis & 1
 
     def _failed(self, error: OSError) -> OutputFailed:
+        missing = OutputFailed.of_missing_folder(self.path, error)
+        if missing is not None and not self._samples:
+            return missing
         remedy = "nothing was written; free space or rights, or choose another folder"
         if self._keeps_part:
             remedy = (

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import inspect
 import pkgutil
+from pathlib import Path
 
 import pytest
 
@@ -21,6 +22,7 @@ from daq.errors import (
     WriteUnconfirmed,
     exit_code,
     first_few,
+    writing,
 )
 from daq.log.feed import FeedUnfit
 from daq.workflow.mesh_files import ShapeUnreadable
@@ -103,3 +105,12 @@ def test_the_first_of_many_texts_are_shown_with_the_number_of_the_others(
     count: int, shown: str
 ) -> None:
     assert first_few("abcdef"[:count], 3, separator=", ", note=" (see below)") == shown
+
+
+def test_a_missing_folder_of_an_output_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "none" / "table.csv"
+    with pytest.raises(OutputFailed, match=r"no folder .*none; .*mkdir -p"), writing(path):
+        path.write_text("")
+    (tmp_path / "none").write_text("a file")
+    with pytest.raises(OutputFailed, match="no folder"), writing(path):
+        path.write_text("")

@@ -106,7 +106,8 @@ def test_the_advice_is_about_the_urdf(
     assert "the URDF that it names" in caught.value.remedy
 
 
-def test_a_text_that_is_no_xml_is_refused_by_its_begin() -> None:
-    """The reader of `ident` took a short one for the name of a file, and gave advice in Python."""
-    with pytest.raises(ConfigurationInconsistent, match=r"no XML: 'hello'.*give the robot's URDF"):
-        urdf_text(b"hello\n", "arm.urdf")
+@pytest.mark.parametrize("text", [b"hello", b"../description/arm.urdf\n"])
+def test_a_file_with_a_name_in_it_is_no_urdf(text: bytes) -> None:
+    """The reader of `ident` took it for its argument, and gave advice in Python."""
+    with pytest.raises(ConfigurationInconsistent, match=r"one line of text.*not a file with its"):
+        urdf_text(text, "arm.urdf")

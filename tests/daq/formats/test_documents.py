@@ -923,3 +923,45 @@ def test_a_key_that_two_places_read_as_is_refused(name: str, text: str) -> None:
         r"/ b and a\.b)",
     ):
         document.locate(("a.b",))
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "key"),
+    [
+        ("a.yaml", "gain: 1e400\n", "gain"),
+        ("a.json", '{"gain": 1e400}', "gain"),
+        ("a.xml", "<a><gain>1e400</gain></a>", "a/gain"),
+        ("a.dcf", "[2003]\nDataType=0x0008\nParameterValue=-1e400\n", "2003"),
+    ],
+)
+def test_a_number_beyond_every_number_is_no_gain(file: str, text: str, key: str) -> None:
+    """It was read as infinity."""
+    with pytest.raises(ControllerUnfit, match=r"1e400, beyond every number of a computer"):
+        decode_document(text.encode(), file).locate((key,))
+
+
+def _integer_document(number: str, limits: str = "") -> DcfDocument:
+    text = f"[2003]\nDataType=0x0004\n{limits}ParameterValue={number}\n"
+    document = decode_document(text.encode(), "a.dcf")
+    assert isinstance(document, DcfDocument)
+    return document
+
+
+@pytest.mark.parametrize("number", ["2147483648", "4294967295", "-2147483649"])
+def test_an_integer_of_a_dcf_that_its_type_does_not_hold_is_refused(number: str) -> None:
+    """4294967295 of an INTEGER32 is −1 in the drive; it was read as 4294967295."""
+    with pytest.raises(ControllerUnfit, match="an integer of its type"):
+        _integer_document(number).locate(("2003",))
+
+
+def test_a_limit_of_a_dcf_does_not_make_an_object_unsigned() -> None:
+    [scalar] = _integer_document("0xFFFFFFFF", "LowLimit=0\n").locate(("2003",))
+    assert scalar.value == -1.0
+
+
+def test_a_long_line_of_blanks_in_a_dcf_does_not_hold_up_its_reader() -> None:
+    """It did not end in minutes: a regular expression tried each blank as the end of the name."""
+    text = "[2003]\nDataType=0x0008\n ParameterValue =  12.5  \n" + " " * 200_000 + "\n"
+    [scalar] = decode_document(text.encode(), "a.dcf").locate(("2003",))
+    assert scalar.value == 12.5
+    assert text[scalar.start : scalar.end] == "12.5"

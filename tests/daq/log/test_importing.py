@@ -1692,3 +1692,76 @@ def test_settings_for_bags_and_csv_are_refused_for_matlab(bench: Bench) -> None:
     # The defaults may be spelled out: they ask for nothing.
     bench.describe(position=position, current=current, table={"delimiter": ","}, topic=None)
     assert bench.run() == 0
+
+
+@pytest.mark.parametrize(
+    ("changes", "place", "found", "expected"),
+    [
+        ({"file": 3}, "position.file", "integer 3", "a valid string, or a valid array"),
+        ({"columns": [0, *NAMES[1:6]]}, "position.columns[0]", "integer 0", "a valid string, or"),
+        ({"reversed": ["J1", "J1"]}, "position.reversed", "J1 more than once", "each axis once"),
+    ],
+)
+def test_a_value_of_no_allowed_kind_is_one_fault_in_words(
+    bench: Bench,
+    capsys: pytest.CaptureFixture[str],
+    changes: Any,
+    place: str,
+    found: str,
+    expected: str,
+) -> None:
+    """A fault was there once for each kind, under names of pydantic: `file.constrained-str`."""
+    position = {"file": "run.csv", "columns": NAMES[:6], "unit": "deg", "side": "joint"} | changes
+    bench.describe(position=position)
+    assert bench.run() == ExitCode.CONFIGURATION
+    shown = capsys.readouterr().err
+    assert f": {place}\n" in shown
+    for text in (found, expected):
+        assert text in shown
+    for internal in ("constrained", "tuple[", "dict["):
+        assert internal not in shown
+    assert not bench.left
+
+
+def test_a_mounting_without_a_payload_is_refused(
+    bench: Bench, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The log was that of a bare arm, without a word."""
+    bench.describe(mounting="flange-a")
+    _refused(bench, capsys, 6, "mounting", "'flange-a' without `payload`")
+
+
+@pytest.mark.parametrize("delimiter", ["1", "e", "-", "_", '"', "\n", "\0"])
+def test_a_delimiter_that_numbers_or_names_have_is_refused(
+    bench: Bench, capsys: pytest.CaptureFixture[str], delimiter: str
+) -> None:
+    bench.describe(table={"delimiter": delimiter})
+    _refused(bench, capsys, 6, "a delimiter that no number or name has")
+
+
+def test_one_name_for_both_logs_is_refused_before_anything_is_written(
+    bench: Bench, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The second log found the first in its way, and the advice was to move it away."""
+    bench.describe(holdout={"from_s": 0.2})
+    link = bench.out.with_name("link.mcap")
+    link.symlink_to(bench.out.name)
+    for name in (bench.out, link):
+        with pytest.raises(UsageError, match="one name for both logs"):
+            import_recording(
+                bench.description, bench.data, bench.out, software="test", holdout=name
+            )
+    assert bench.left == ["link.mcap"]
+
+
+def test_a_folder_that_is_not_there_is_what_is_named(
+    bench: Bench, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The advice was to free space."""
+    bench.out = bench.folder / "none" / "run.mcap"
+    assert bench.run() == ExitCode.UNEXPECTED
+    shown = capsys.readouterr().err
+    assert f"no folder {bench.out.parent}" in shown
+    assert "mkdir -p" in shown
+    assert "space" not in shown
+    assert not bench.out.parent.exists()
