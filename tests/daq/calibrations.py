@@ -77,12 +77,13 @@ def calibration_for(cell_file: Path, factor: float = 1.0, **changes: Any) -> Pat
     declared = load_cell(cell_file)
     now = datetime.now(UTC)
     calibration = recorded(demo_calibration(), now - timedelta(hours=1))
+    gains = tuple(replace(gain, value=gain.value * factor) for gain in calibration.gains)
     calibration = replace(
         calibration,
         created=now.isoformat(),
         configuration_sha256=declared.digest,
         recording_configuration_sha256=declared.recording_digest,
-        gains=tuple(replace(gain, value=gain.value * factor) for gain in calibration.gains),
+        gains=gains,
     )
     path = cell_file.parent / f"calibration-{factor:g}.yaml"
     changed_calibration = replace(calibration, **changes)
@@ -127,9 +128,10 @@ def of_first_axes(calibration: Calibration, count: int) -> Calibration:
     error = calibration.relative_error_percent
     relative_error_percent = replace(error, axes=error.axes[:count])
     holdout_error_percent = first(calibration.holdout_error_percent)
+    gains = calibration.gains[:count]
     cut = replace(
         calibration,
-        gains=calibration.gains[:count],
+        gains=gains,
         relative_error_percent=relative_error_percent,
         holdout_error_percent=holdout_error_percent,
         nameplate_holdout_error_percent=first(calibration.nameplate_holdout_error_percent),

@@ -30,7 +30,8 @@ def content(
 def demo_content(checkout: Path, payload: Payload | None = None) -> LogContent:
     """The start of a log of the demo cell."""
     path = checkout / "configs/cells/demo.yaml"
-    return replace(content(6, payload, bundle(path)), urdf=load_cell(path).urdf)
+    urdf = load_cell(path).urdf
+    return replace(content(6, payload, bundle(path)), urdf=urdf)
 
 
 def samples(rows: Sequence[Sequence[int]], status: int = 0x1237, missing: int = 0) -> list[Sample]:
@@ -46,7 +47,10 @@ def samples(rows: Sequence[Sequence[int]], status: int = 0x1237, missing: int = 
 
 def rising_counts(rows: int, axes: int) -> list[list[int]]:
     """Counts of so many rows: row k begins with 100 k, and each axis has one count more."""
-    return [list(range(100 * row, 100 * row + axes)) for row in range(rows)]
+    found = []
+    for row in range(rows):
+        found.append(list(range(100 * row, 100 * row + axes)))
+    return found
 
 
 def joints(counts: Sequence[int]) -> list[float]:

@@ -53,7 +53,8 @@ def test_look_write_and_go_back(
     assert "J4, 2003h:01: -11520 -> -9210" in shown
     assert "Dry run, nothing was written." in shown
     assert [entered_gain(node) for node in simulation.nodes] == pytest.approx(NAMEPLATE)
-    base = shown.split("--base ")[1].split()[0]
+    words = shown.split("--base ")
+    base = words[1].split()[0]
 
     apply_in_drives(drive_cell, yes=True, base=base)
     output = capsys.readouterr().out
@@ -76,27 +77,29 @@ def test_look_write_and_go_back(
     assert [saved_gain(node) for node in simulation.nodes] == pytest.approx(NAMEPLATE)
     assert drive_cell.history is not None
     entered = AuditAction.CALIBRATION_ENTERED
-    assert [
-        (entry.action, entry.who, entry.subject) for entry in read(drive_cell.history.audit)
-    ] == [
+    actions = (
+        AuditAction.APPLY_BEGUN,
+        AuditAction.APPLIED,
+        entered,
+        AuditAction.ROLLBACK_BEGUN,
+        AuditAction.ROLLED_BACK,
+    )
+    entries = read(drive_cell.history.audit)
+    assert [(entry.action, entry.who, entry.subject) for entry in entries] == [
         (
             action,
             "Kim (login kim)",
             "history of demo" if action is entered else "drives of cell demo",
         )
-        for action in (
-            AuditAction.APPLY_BEGUN,
-            AuditAction.APPLIED,
-            entered,
-            AuditAction.ROLLBACK_BEGUN,
-            AuditAction.ROLLED_BACK,
-        )
+        for action in actions
     ]
     evidence = read(drive_cell.history.audit)[0].details
     assert evidence["configuration_sha256"] == demo_calibration().configuration_sha256
+    sha256 = hashlib.sha256(encode_calibration(demo_calibration())).hexdigest()
+    file = str(Path("calibration.yaml").absolute())
     expected = {
-        "file": str(Path("calibration.yaml").absolute()),
-        "sha256": hashlib.sha256(encode_calibration(demo_calibration())).hexdigest(),
+        "file": file,
+        "sha256": sha256,
         "cell": "demo",
         "created": demo_calibration().created,
         "software": demo_calibration().software,
@@ -109,9 +112,8 @@ def test_look_write_and_go_back(
     assert targets == ["drives of cell demo"] * 2
     assert history.in_force() is None
     # The two entries that record how the writes ended.
-    assert {event.audit for event in history.events} == {
-        entry.sha256 for entry in read(drive_cell.history.audit)[1::3]
-    }
+    audits = {event.audit for event in history.events}
+    assert audits == {entry.sha256 for entry in read(drive_cell.history.audit)[1::3]}
     _back(drive_cell)
     assert (
         read_history(ledger).in_force()
@@ -123,13 +125,15 @@ def test_look_write_and_go_back(
 def test_a_program_gets_all_of_it(drive_cell: Cell, capsys: pytest.CaptureFixture[str]) -> None:
     apply_in_drives(drive_cell, as_json=True)
     reviewed = json.loads(capsys.readouterr().out)
-    assert (reviewed["applied"], reviewed["refusals"]) == (False, [])
+    assert reviewed["applied"] is False
+    assert reviewed["refusals"] == []
     assert reviewed["changes"][3]["new"] == -9.21
     apply_in_drives(drive_cell, as_json=True, yes=True, saving=Saving.RAM)
     text = capsys.readouterr().out
     written = json.loads(text)
     DriveChange.model_validate_json(text)
-    assert (written["applied"], written["saved"]) == (True, False)
+    assert written["applied"] is True
+    assert written["saved"] is False
     assert written["base_sha256"] == reviewed["base_sha256"]
     assert Path(written["record"]).is_file()
     for yes in (False, True):
@@ -206,10 +210,11 @@ def test_a_bus_that_another_client_has_is_left_alone(drive_cell: Cell) -> None:
 
 
 def test_the_two_options_of_saving() -> None:
-    assert [saving_of(False, False), saving_of(True, False), saving_of(False, True)] == [
+    expected = [
         Saving.KNOWN,
         Saving.RAM,
         Saving.ANY,
     ]
+    assert [saving_of(False, False), saving_of(True, False), saving_of(False, True)] == expected
     with pytest.raises(UsageError, match="one of them"):
         saving_of(True, True)

@@ -9,10 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from daq.advice import for_command_line
-from daq.cli.app import main
 from daq.cli.scan import read_code
 from daq.errors import ExitCode
 from drivers.canopen.emcy import remedy_of
+from tests.daq.command_line import run_verb
 
 
 @settings(deadline=None)
@@ -36,9 +36,9 @@ def test_every_spelling_of_a_manual_is_the_same_code(code: int) -> None:
 def test_codes_of_the_standards_and_of_makers(
     capsys: pytest.CaptureFixture[str], code: str, words: str, standard: bool
 ) -> None:
-    assert main(["explain-emcy", code]) == ExitCode.OK
+    assert run_verb("explain-emcy", code) == ExitCode.OK
     assert words in capsys.readouterr().out
-    assert main(["explain-emcy", code, "--json"]) == ExitCode.OK
+    assert run_verb("explain-emcy", code, "--json") == ExitCode.OK
     document = json.loads(capsys.readouterr().out)
     expected = (read_code(code), standard)
     assert (document["code"], document["standard"]) == expected
@@ -52,5 +52,5 @@ def test_codes_of_the_standards_and_of_makers(
 
 @pytest.mark.parametrize("code", ["", "8g11", "12345", "-1", "0x", "eight"])
 def test_what_is_no_code_is_refused(capsys: pytest.CaptureFixture[str], code: str) -> None:
-    assert main(["explain-emcy", "--", code]) == ExitCode.USAGE
+    assert run_verb("explain-emcy", "--", code) == ExitCode.USAGE
     assert "hexadecimal" in capsys.readouterr().err

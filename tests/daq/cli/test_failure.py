@@ -16,7 +16,6 @@ from typing import Any
 
 import pytest
 
-from daq.cli.app import main
 from daq.cli.failure import ADVICE, ADVICE_WITHIN, ErrorParts, show_failure
 from daq.errors import DataError, ExitCode, OutputFailed
 from daq.report.document import ErrorReport, json_tree
@@ -24,6 +23,7 @@ from drivers.canopen.bus import bus_errors
 from drivers.canopen.emcy import remedy_of
 from drivers.errors import BusError, DriveFault, DriverError
 from ident.errors import IdentificationError
+from tests.daq.command_line import run_verb
 
 
 def _all(root: type[Exception]) -> Iterator[type[Exception]]:
@@ -75,9 +75,11 @@ def test_no_verb_that_asks_the_drives_advises_to_run_itself(
         object.__setattr__(error, name, "")
     failure = ErrorParts.of(error, verb)
     assert failure.do
-    own = re.findall(rf"`drivegain {verb} CELL([^`]*)`", failure.do)
+    pattern = rf"`drivegain {verb} CELL([^`]*)`"
+    own = re.findall(pattern, failure.do)
     # An option that was not given would be another command.
-    assert all("--" in options for options in own), failure.do
+    for options in own:
+        assert "--" in options, failure.do
 
 
 def test_advice_names_verbs_that_exist(capsys: pytest.CaptureFixture[str]) -> None:
@@ -87,9 +89,10 @@ def test_advice_names_verbs_that_exist(capsys: pytest.CaptureFixture[str]) -> No
     for expected, remedy in advice:
         matches = re.findall(r"`drivegain ([a-z-]+)([^`]*)`", f"{expected} {remedy}")
         for verb, rest in matches:
-            assert main([verb, "--help"]) == 0
+            assert run_verb(verb, "--help") == 0
             text = capsys.readouterr().out
-            assert all(option in text for option in re.findall(r"--[a-z-]+", rest))
+            for option in re.findall(r"--[a-z-]+", rest):
+                assert option in text
 
 
 @pytest.mark.parametrize(
@@ -121,13 +124,13 @@ def test_a_refused_connection_names_the_command_that_starts_a_cell(
 ) -> None:
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
-    assert main(["init", str(tmp_path / "lathe"), "--simulated"]) == 0
+    assert run_verb("init", tmp_path / "lathe", "--simulated") == 0
     cell = tmp_path / "lathe/cells/lathe.yaml"
     text = cell.read_text(encoding="utf-8")
     changed_text = text.replace("29536", str(port))
     cell.write_text(changed_text, encoding="utf-8")
     capsys.readouterr()
-    assert main(["scan", str(cell)]) == ExitCode.DEVICE_FAULT
+    assert run_verb("scan", cell) == ExitCode.DEVICE_FAULT
     said = capsys.readouterr().err
     assert re.search(
         r"^found: .*connection refused.*\nexpected: .*\ndo: .*drivegain "
@@ -182,7 +185,7 @@ def test_an_error_that_cannot_be_printed_keeps_its_exit_code(
 ) -> None:
     with Path("/dev/full").open("w", buffering=1, encoding="utf-8") as full:
         monkeypatch.setattr(sys, "stderr", full)
-        assert main(["scan", "missing.yaml", *json_option]) == ExitCode.CONFIGURATION
+        assert run_verb("scan", "missing.yaml", *json_option) == ExitCode.CONFIGURATION
         monkeypatch.undo()
         with suppress(OSError):  # what could not be written is tried again
             full.close()
@@ -196,7 +199,7 @@ def test_an_error_of_a_verb_is_an_object_under_json(
         ["info", str(tmp_path / "none.mcap")],
         ["explain-emcy", "x"],
     ):
-        code = main([*arguments, "--json"])
+        code = run_verb(*arguments, "--json")
         output = capsys.readouterr()
         document: dict[str, Any] = json.loads(output.err)
         assert output.out == ""
@@ -217,7 +220,7 @@ def test_an_interrupt_says_what_was_kept_and_leaves_no_empty_folder(
     (tmp_path / "kept").mkdir()
     report_folder = tmp_path / "new" / "report"
     for folder, stays in ((report_folder, False), (tmp_path / "kept", True)):
-        assert main(["residual", "x.mcap", "--report", str(folder)]) == ExitCode.INTERRUPTED
+        assert run_verb("residual", "x.mcap", "--report", folder) == ExitCode.INTERRUPTED
         assert capsys.readouterr().err.endswith("interrupted: no file was written\n")
         assert folder.exists() is stays
     assert not (tmp_path / "new").exists()

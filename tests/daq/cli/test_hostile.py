@@ -21,6 +21,7 @@ from daq.log.metadata import (
 )
 from daq.log.writer import LogWriter
 from drivers.errors import DriveFault
+from tests.daq.command_line import run_verb
 from tests.daq.logs import DISC, content, demo_content, joints, samples, write
 
 
@@ -108,7 +109,7 @@ def test_info_refuses_the_counts_that_a_fit_refuses(
     )
     path = tmp_path / "a.mcap"
     log = write(path, demo_content(checkout), samples([[k] * 6 for k in range(300)]))
-    assert main(["info", str(log), "--json"]) == ExitCode.DATA_UNFIT
+    assert run_verb("info", log, "--json") == ExitCode.DATA_UNFIT
     output = capsys.readouterr()
     assert output.out == ""
     assert says in output.err
@@ -182,7 +183,7 @@ def test_an_unwritable_standard_output_is_no_traceback(
         raise OSError(28, os.strerror(28))
 
     monkeypatch.setattr("daq.log.importing.import_recording", lambda *_, **__: full(None))
-    code = main(["import", "x.yaml", "--data", ".", "--out", "y.mcap"])
+    code = run_verb("import", "x.yaml", "--data", ".", "--out", "y.mcap")
     assert code == ExitCode.UNEXPECTED
     assert "no space left" in capsys.readouterr().err
 
@@ -207,7 +208,8 @@ def test_one_name_for_two_outputs_is_refused_before_any_log_is_read(
     verb: str, other: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     same = str(tmp_path / "same")
-    assert main([verb, str(tmp_path / "no.mcap"), "--out", same, other, same]) == ExitCode.USAGE
+    code = run_verb(verb, tmp_path / "no.mcap", "--out", same, other, same)
+    assert code == ExitCode.USAGE
     error_output = capsys.readouterr().err
     assert f"the same name for --out and {other}" in error_output
     assert not list(tmp_path.iterdir())
@@ -217,8 +219,6 @@ def test_one_name_for_two_outputs_is_refused_before_any_log_is_read(
 def test_a_missing_folder_is_named_before_any_log_is_read(
     verb: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert (
-        main([verb, str(tmp_path / "no.mcap"), "--out", str(tmp_path / "missing/c.yaml")])
-        == ExitCode.UNEXPECTED
-    )
+    code = run_verb(verb, tmp_path / "no.mcap", "--out", tmp_path / "missing/c.yaml")
+    assert code == ExitCode.UNEXPECTED
     assert "no such folder" in capsys.readouterr().err

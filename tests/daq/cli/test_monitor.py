@@ -20,7 +20,6 @@ from rich.console import Console
 from rich.table import Table
 
 from daq.advice import for_command_line
-from daq.cli.app import main
 from daq.config.cell import Cell, PacingMode, model_of
 from daq.config.cell_buses import answer_us, bus_loads_percent, drive_axes
 from daq.config.cell_file import load_cell
@@ -59,6 +58,7 @@ from ident.calibration import Calibration
 from ident.data.dataset import planned
 from ident.model.robot import Motion
 from ident.prediction import predict_current
+from tests.daq.command_line import run_verb
 from tests.daq.console.feeds import facts, predicting_calibration
 from tests.drivers.quiet_bus import QuietBus, frame, overheard_cycle
 from tests.drivers.scripted import FakeClock
@@ -115,19 +115,20 @@ def test_nothing_is_sent_while_another_master_leads_and_its_losses_are_counted(
     monitor = _monitor(bus)
     start = bus.clock.now_ns
     for cycle in range(500):
-        bus.coming += overheard_cycle(
-            start + (cycle + 1) * 10_000_000, cycle, silent=3 if cycle in (200, 201) else None
-        )
+        silent = 3 if cycle in (200, 201) else None
+        at_ns = start + (cycle + 1) * 10_000_000
+        bus.coming += overheard_cycle(at_ns, cycle, silent=silent)
     reading = monitor.watch(5.005)
     assert bus.sent == []
     assert reading.source is ReadingSource.OVERHEARD
-    assert [axis.position_counts for axis in reading.axes] == [
-        1000 * node + 499 for node in range(1, 7)
-    ]
-    assert [axis.current_raw for axis in reading.axes] == [-1, -2, -3, -4, -5, -6]
+    expected = [1000 * node + 499 for node in range(1, 7)]
+    assert [axis.position_counts for axis in reading.axes] == expected
+    current_raw = [axis.current_raw for axis in reading.axes]
+    assert current_raw == [-1, -2, -3, -4, -5, -6]
     assert [axis.lost for axis in reading.axes] == [0, 0, 2, 0, 0, 0]
     assert reading.sync_hz == pytest.approx(100, rel=0.01)
-    assert reading.axes[0].rate_hz == pytest.approx(100, rel=0.01)
+    rate_hz = reading.axes[0].rate_hz
+    assert rate_hz == pytest.approx(100, rel=0.01)
     assert reading.axes[2].rate_hz == pytest.approx(498 / 5.005, rel=1e-6)
     # SYNC and six answers in 10 ms, by the count that a recording is refused with.
     profiles = [axis.profile for axis in CELL.axes if axis.profile is not None]
@@ -153,8 +154,10 @@ def test_asking_leaves_the_bus_to_others(bus: QuietBus, monkeypatch: pytest.Monk
 
     monkeypatch.setattr(bus, "send", answer)
     reading = monitor.watch(5.0)
-    assert all(axis.rate_hz == pytest.approx(1 / READING_S, rel=0.15) for axis in reading.axes)
-    assert answered == pytest.approx(6 * 3 * 5.0 / READING_S, rel=0.15)
+    for axis in reading.axes:
+        assert axis.rate_hz == pytest.approx(1 / READING_S, rel=0.15)
+    expected = 6 * 3 * 5.0 / READING_S
+    assert answered == pytest.approx(expected, rel=0.15)
     assert bus_loads_percent(CELL, reading)[0] < 6.0
     assert len(samples) == pytest.approx(5.0 / READING_S, rel=0.15)
     assert {sample.missing for sample in samples[5:]} == {0}
@@ -172,9 +175,8 @@ def test_positions_are_those_of_the_joints_and_unknown_where_a_motor_is(
     counts[unknown] = None
     shown = joint_positions(CELL, _reading(counts))
     # Motor 6 turns with joints 5 and 6: without motor 5 neither of the two is known (paper eq. 24).
-    assert {number for number, value in enumerate(shown) if value is None} == (
-        {4, 5} if unknown == 4 else {unknown}
-    )
+    expected = {4, 5} if unknown == 4 else {unknown}
+    assert {number for number, value in enumerate(shown) if value is None} == expected
 
 
 def _reading(counts: list[int | None]) -> CellReading:
@@ -186,12 +188,12 @@ def test_what_is_not_known_is_shown_as_that() -> None:
     out = io.StringIO()
     dead = AxisReading(None, None, None, None, 0.0, 3, heard=False)
     reading = _reading([0] * 6)
-    reading = CellReading(reading.source, 0.5, (*reading.axes[:5], dead), 0.0, ((0,) * 9,), ())
+    axes = (*reading.axes[:5], dead)
+    reading = CellReading(reading.source, 0.5, axes, 0.0, ((0,) * 9,), ())
     event = CellEvent(0, None, EventKind.CONTROLLER, 0, "a\x1b[2Jb")
     ampere = (0.002, None, None, None, None, None)
-    report = monitor_report(
-        CELL, WatchedCell(reading, joint_positions(CELL, reading), ampere, (event,))
-    )
+    watched = WatchedCell(reading, joint_positions(CELL, reading), ampere, (event,))
+    report = monitor_report(CELL, watched)
     Console(file=out, width=100).print(monitor_view(report))
     text = out.getvalue()
     assert "+0.010 A" in text
@@ -202,7 +204,8 @@ def test_what_is_not_known_is_shown_as_that() -> None:
     off = tuple(replace(axis, statusword=0x250) for axis in reading.axes[:5])
     without = replace(reading, axes=(*off, dead))
     report = monitor_report(CELL, WatchedCell(without, joint_positions(CELL, without), ampere, ()))
-    assert report.axes[0].current_a == pytest.approx(0.01)  # the document has what the drive says
+    current_a = report.axes[0].current_a
+    assert current_a == pytest.approx(0.01)  # the document has what the drive says
     out = io.StringIO()
     Console(file=out, width=100).print(monitor_view(report))
     assert out.getvalue().count("no power") == 5
@@ -233,8 +236,7 @@ def test_a_simulated_cell_is_shown_and_left_as_it_was(
         simulated = SimulatedCell(load_simulation(shipped_simulation("clean")), bus)
         with simulated:
             assert (
-                main(["monitor", str(quiet_cell_file), "--json", "--interval", "0.5"])
-                == ExitCode.OK
+                run_verb("monitor", quiet_cell_file, "--json", "--interval", "0.5") == ExitCode.OK
             )
         document = json.loads(capsys.readouterr().out)
         asked = []
@@ -254,14 +256,13 @@ def test_a_simulated_cell_is_shown_and_left_as_it_was(
     declared: Cell = load_cell(quiet_cell_file)
     for axis, expected in zip(document["axes"], [0.0, 0.0, 90.0, 0.0, 0.0, 0.0], strict=True):
         assert axis["position"] == pytest.approx(expected, abs=1e-2)
-        assert (axis["state"], axis["enabled"], axis["silent"]) == (
-            "SWITCH ON DISABLED",
-            False,
-            False,
-        )
+        assert axis["state"] == "SWITCH ON DISABLED"
+        assert axis["enabled"] is False
+        assert axis["silent"] is False
         assert axis["current_a"] is not None
         assert axis["rate_hz"] > 0
-    assert [axis["axis"] for axis in document["axes"]] == list(declared.axis_names)
+    axes = [axis["axis"] for axis in document["axes"]]
+    assert axes == list(declared.axis_names)
     assert document["bus_load_percent"] > 0
 
 
@@ -269,8 +270,7 @@ def test_a_cell_that_is_not_there_is_a_device_fault(
     quiet_cell_file: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert (
-        main(["monitor", str(quiet_cell_file), "--once", "--interval", "0.1"])
-        == ExitCode.DEVICE_FAULT
+        run_verb("monitor", quiet_cell_file, "--once", "--interval", "0.1") == ExitCode.DEVICE_FAULT
     )
     streams = capsys.readouterr()
     assert "(SILENT)" in streams.out
@@ -294,10 +294,12 @@ def test_a_node_that_aborts_is_not_called_silent(
             return sound(index, subindex)
 
         monkeypatch.setattr(node._sdo, "_read", read)
-        assert main(["monitor", str(quiet_cell_file), "--json", "--interval", "0.5"]) == ExitCode.OK
+        assert run_verb("monitor", quiet_cell_file, "--json", "--interval", "0.5") == ExitCode.OK
     document = json.loads(capsys.readouterr().out)
     refusing = document["axes"][2]
-    assert (refusing["silent"], refusing["rate_hz"], refusing["state"]) == (False, 0.0, None)
+    assert refusing["silent"] is False
+    assert refusing["rate_hz"] == 0.0
+    assert refusing["state"] is None
     assert refusing["position"] == pytest.approx(90.0, abs=1e-2)
     assert refusing["current_a"] is not None
     assert refusing["refused"] == [{"object": "6041h:00", "abort_code": 0x06020000}]
@@ -323,7 +325,8 @@ def test_a_refused_object_is_no_value_and_forgotten_when_it_is_given(
     watch = _watch(bus, tmp_path / "cell.yaml")
     watch.listen(QUIET_S)
     report = monitor_report(CELL, watch.read(0.5))
-    assert [axis.remark for axis in report.axes] == [remark] * 6
+    remarks = [axis.remark for axis in report.axes]
+    assert remarks == [remark] * 6
     assert {(axis.statusword, axis.rate_hz, axis.lost) for axis in report.axes} == {(None, 0.0, 0)}
     answers[0] = bytes.fromhex("4b41600050020000")
     report = monitor_report(CELL, watch.read(0.5))
@@ -343,7 +346,8 @@ def test_a_node_that_answers_after_400_ms_is_called_slow(
     assert 0.5 * sum(axis.rate_hz for axis in slow) >= 3  # in 5 s; a reading has three objects
     assert {(axis.silent, axis.lost) for axis in slow} == {(False, 0)}
     assert slow[-1].position_counts == 0
-    assert {report.axes[1].remark for report in reports} == {""}
+    remarks = {report.axes[1].remark for report in reports}
+    assert remarks == {""}
     assert "J1 answers after 400 ms" in _view(reports[-1])
 
 
@@ -363,7 +367,7 @@ def test_a_cell_that_is_slower_than_one_reading_gets_more_time(
         monkeypatch.setattr(simulated.nodes[0], "request", late)
         for node in simulated.nodes:
             node.write(0x1017, 0, bytes(2))  # no heartbeat
-        assert main(["monitor", str(quiet_cell_file), "--json", "--interval", "0.1"]) == ExitCode.OK
+        assert run_verb("monitor", quiet_cell_file, "--json", "--interval", "0.1") == ExitCode.OK
     assert json.loads(capsys.readouterr().out)["axes"][0]["remark"].startswith("answers after ")
 
 
@@ -400,13 +404,13 @@ def test_our_own_recorder_is_no_other_master(tmp_path: Path) -> None:
     assert not bus_taken(CELL, tmp_path)
     assert not bus_taken(CELL, tmp_path, tmp_path / "no list of locks")
     axis = AxisReading(0, 1, 0x1208, None, 1.0, 0)
-    reading = CellReading(ReadingSource.OVERHEARD, 1.0, (axis,) * 6, 100.0, ((0,) * 9,), ())
+    axes = (axis,) * 6
+    reading = CellReading(ReadingSource.OVERHEARD, 1.0, axes, 100.0, ((0,) * 9,), ())
     said = []
     for recorder in (False, True):
         out = io.StringIO()
-        report = monitor_report(
-            CELL, WatchedCell(reading, (None,) * 6, (None,) * 6, (), recorder=recorder)
-        )
+        watched = WatchedCell(reading, (None,) * 6, (None,) * 6, (), recorder=recorder)
+        report = monitor_report(CELL, watched)
         Console(file=out, width=200).print(monitor_view(report))
         said.append(out.getvalue())
     assert "another master" in said[0]
@@ -450,16 +454,16 @@ def _moving(bus: QuietBus, seconds: float, factor: float) -> RunFacts:
     time_s = np.arange(round(seconds * PREDICTED_HZ)) / PREDICTED_HZ
     omega: FloatArray = 2.0 * np.pi * np.linspace(0.5, 1.0, 6)
     phase = omega * time_s[:, None]
-    motion = Motion(
-        0.5 * np.sin(phase), 0.5 * omega * np.cos(phase), -0.5 * omega**2 * np.sin(phase)
-    )
+    acceleration_rad_s2 = -0.5 * omega**2 * np.sin(phase)
+    velocity_rad_s = 0.5 * omega * np.cos(phase)
+    position_rad = 0.5 * np.sin(phase)
+    motion = Motion(position_rad, velocity_rad_s, acceleration_rad_s2)
     current = predict_current(calibration, model, planned(motion, PREDICTED_HZ, None))
     current[:, 3] *= factor
     run = replace(facts(CELL, Path("run.mcap")), rate_hz=PREDICTED_HZ)
     # Fine enough that an acceleration shows no count; 16 bits hold the currents.
-    run = replace(
-        run, rad_per_count=[1e-7] * 6, current_per_unit=(np.abs(current).max(axis=0) / 3e4).tolist()
-    )
+    current_per_unit = (np.abs(current).max(axis=0) / 3e4).tolist()
+    run = replace(run, rad_per_count=[1e-7] * 6, current_per_unit=current_per_unit)
     counts = np.rint(motion.position_rad / 1e-7).astype(int)
     raw = np.rint(current / run.current_per_unit).astype(int)
     start = bus.clock.now_ns
@@ -529,16 +533,20 @@ def test_the_rate_of_another_master_is_measured_once_its_sync_is_steady(
     _moving(bus, 4.0, 1.0)
     bus.clock.now_ns -= 300_000_000  # it begins within the first reading
     assert CELL.sync is not None
-    timed = replace(CELL, sync=replace(CELL.sync, pacing=PacingMode.TIMED))
+    sync = replace(CELL.sync, pacing=PacingMode.TIMED)
+    timed = replace(CELL, sync=sync)
     watch = _watch(bus, tmp_path / "cell.yaml", predicting_calibration(), cell=timed)
     watch.listen(0.5)
     assert watch._facts is None
     reports = [monitor_report(CELL, watch.read(0.5)) for _ in range(6)]
     assert watch._facts is not None
     assert watch._facts.rate_hz == pytest.approx(PREDICTED_HZ, rel=0.01)
-    predictions = [axis.prediction for axis in reports[-1].axes if axis.prediction is not None]
+    axes = reports[-1].axes
+    predictions = [axis.prediction for axis in axes if axis.prediction is not None]
     assert len(predictions) == 6
-    assert all(found.measured is None and found.residual_rms is None for found in predictions)
+    for found in predictions:
+        assert found.measured is None
+        assert found.residual_rms is None
 
 
 def test_queried_axes_are_too_slow_for_a_prediction_and_their_faults_have_a_remedy(
@@ -563,7 +571,8 @@ def test_queried_axes_are_too_slow_for_a_prediction_and_their_faults_have_a_reme
     assert report.source == "asked"
     assert report.prediction is not None
     assert "10 positions a second are too few" in report.prediction.remark
-    assert [axis.prediction for axis in report.axes] == [None] * 6
+    predictions = [axis.prediction for axis in report.axes]
+    assert predictions == [None] * 6
     assert [axis.fault is not None for axis in report.axes] == [
         False,
         False,
@@ -573,7 +582,8 @@ def test_queried_axes_are_too_slow_for_a_prediction_and_their_faults_have_a_reme
         False,
     ]
     fault = report.axes[2].fault
-    assert fault is not None and fault.model_dump() == asdict(explain_error_code(0x7305))
+    assert fault is not None
+    assert fault.model_dump() == asdict(explain_error_code(0x7305))
     out = io.StringIO()
     Console(file=out, width=200).print(monitor_view(report))
     assert (
@@ -584,11 +594,12 @@ def test_queried_axes_are_too_slow_for_a_prediction_and_their_faults_have_a_reme
     bus.coming.append((bus.clock.now_ns, frame(0x82, struct.pack("<HB5x", 0x3210, 1))))
     for node in range(1, 7):  # other events do not displace it
         bus.coming.append((bus.clock.now_ns, frame(0x700 + node, b"\x05")))
-    (notice,) = (one for one in monitor_report(CELL, watch.read(0.5)).notices if one.alarm)
-    assert notice.model_dump() == asdict(notice_of(EventKind.EMCY, 0x3210, "J2", notice.text))
-    assert notice.text.startswith("EMCY 3210h") and notice.remedy == for_command_line(
-        remedy_of(0x3210)
-    )
+    notices = monitor_report(CELL, watch.read(0.5)).notices
+    (notice,) = (one for one in notices if one.alarm)
+    expected = asdict(notice_of(EventKind.EMCY, 0x3210, "J2", notice.text))
+    assert notice.model_dump() == expected
+    assert notice.text.startswith("EMCY 3210h")
+    assert notice.remedy == for_command_line(remedy_of(0x3210))
 
 
 def test_each_reading_publishes_the_load_of_the_buses(
@@ -601,7 +612,8 @@ def test_each_reading_publishes_the_load_of_the_buses(
     watch.listen(QUIET_S)
     for _ in range(2):
         watch.read(1.1)
-    assert [list(load) for load in loads] == [[one.name for one in CELL.buses]] * 2
+    expected = [[one.name for one in CELL.buses]] * 2
+    assert [list(load) for load in loads] == expected
     for load_of_bus in loads:
         for load in load_of_bus.values():
             assert 0.0 < load < 0.06

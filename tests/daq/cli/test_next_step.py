@@ -33,6 +33,7 @@ from ident.calibration import AcceptedEffect
 from ident.errors import Diagnosis
 from ident.estimators.estimate import RelativeError
 from tests.daq.calibrations import calibration_for, demo_calibration
+from tests.daq.command_line import run_verb
 from tests.daq.logs import DISC, demo_content, samples, write
 from tests.pipeline.next_step import next_step
 
@@ -70,7 +71,7 @@ def made(checkout: Path, tmp_path_factory: pytest.TempPathFactory) -> Plan:
     cell_file = checkout / "configs/cells/demo.yaml"
     out = tmp_path_factory.mktemp("plan") / "plan.yaml"
     quick = ["--duration", "15", "--exchanges", "0", "--sigma", "9"]
-    assert main(["plan", str(cell_file), "--out", str(out), *quick]) == 0
+    assert run_verb("plan", cell_file, "--out", out, *quick) == 0
     return load_plan(out, load_cell(cell_file))
 
 
@@ -216,10 +217,10 @@ def test_a_calibration_is_followed_by_its_dry_run(
     file = calibration_for(CELL)
     say_after_calibration(load_calibration(file), file, [log], None)
     error_output = capsys.readouterr().err
-    assert words(error_output) == ["drivegain", "apply", str(CELL), str(file)]
-    fixed = replace(
-        demo_calibration(), gains=tuple(replace(gain, std=0.0) for gain in demo_calibration().gains)
-    )
+    expected = ["drivegain", "apply", str(CELL), str(file)]
+    assert words(error_output) == expected
+    gains = tuple(replace(gain, std=0.0) for gain in demo_calibration().gains)
+    fixed = replace(demo_calibration(), gains=gains)
     assert fixed.gains_fixed
     say_after_calibration(fixed, Path("calibration.yaml"), [log], CELL)
     assert capsys.readouterr().err == ""
@@ -336,7 +337,8 @@ def test_a_new_cell_file_is_edited_first_unless_it_is_of_the_simulated_cell(
     simulated: bool,
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert main(["init", "saw", *(["--simulated"] if simulated else [])]) == 0
+    code = run_verb("init", "saw", *(["--simulated"] if simulated else []))
+    assert code == 0
     first, last = capsys.readouterr().err.splitlines()
     assert first.startswith(
         "The cell is that of the demonstration" if simulated else "Edit saw/cells/saw.yaml first"

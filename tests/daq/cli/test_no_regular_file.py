@@ -21,6 +21,7 @@ from daq.cli.verb import Verb
 from daq.documents.calibration_file import save_calibration
 from daq.errors import ExitCode
 from tests.daq.calibrations import demo_calibration
+from tests.daq.command_line import run_verb
 from tests.daq.logs import demo_content, samples, write
 
 VALID = {
@@ -145,7 +146,7 @@ def test_an_output_whose_temporary_name_is_too_long_asks_for_a_shorter_one(
 ) -> None:
     monkeypatch.chdir(folder)
     name = "x" * 250 + ".html"
-    code = main(["certificate", "calibration.yaml", "--cell", VALID["cell"], "--out", name])
+    code = run_verb("certificate", "calibration.yaml", "--cell", VALID["cell"], "--out", name)
     assert code == ExitCode.UNEXPECTED
     assert "choose a shorter name" in capsys.readouterr().err
 
@@ -160,7 +161,6 @@ def test_devices_and_sockets_are_refused_like_pipes(
     with socket.socket(socket.AF_UNIX) as bound:
         bound.bind(str(tmp_path / "socket"))
         for place in (Path("/dev/zero"), tmp_path / "socket", folder / "pipe"):
-            assert (
-                main([*verb, str(place), *(out if verb != ["info"] else ())]) == ExitCode.DATA_UNFIT
-            )
+            code = run_verb(*verb, place, *(out if verb != ["info"] else ()))
+            assert code == ExitCode.DATA_UNFIT
             assert "no regular file" in capsys.readouterr().err

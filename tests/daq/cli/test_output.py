@@ -21,7 +21,6 @@ from pathlib import Path
 
 import pytest
 
-from daq.cli.app import main
 from daq.cli.output import (
     CHUNK_BYTES,
     PATIENCE_S,
@@ -41,6 +40,7 @@ from daq.errors import ExitCode
 from daq.jobs.journal import Form, Journal, Level
 from daq.jobs.story import Story
 from tests.daq.cli.screens import full_pipe, printing_to
+from tests.daq.command_line import run_verb
 
 LONG_S = 20.0  #: For what takes milliseconds
 NOBODY_S = 0.05  #: Patience where nobody reads
@@ -87,7 +87,8 @@ def _remark(number: int) -> Piece:
 def test_pieces_get_out_in_order_and_whole(file: FakeFile) -> None:
     file.reads.set()
     writer = _writer(file)
-    pieces = [_remark(1), Piece(OutputKind.RESULT, b"x" * 3 * CHUNK_BYTES), _remark(2)]
+    content = b"x" * 3 * CHUNK_BYTES
+    pieces = [_remark(1), Piece(OutputKind.RESULT, content), _remark(2)]
     for piece in pieces:
         writer.put(piece)
     writer.wait()
@@ -315,7 +316,8 @@ def test_the_first_progress_of_a_bar_loads_no_module() -> None:
         shown = bytearray()
         _drain(operator_side, shown)
         loaded, _ = process.communicate(timeout=LONG_S)
-    assert (process.returncode, loaded.strip()) == (0, "[]")
+    assert process.returncode == 0
+    assert loaded.strip() == "[]"
     assert b"recording" in shown
 
 
@@ -425,7 +427,7 @@ sys.exit(daq.cli.app.main())
 def test_in_process_the_streams_are_those_of_before(capfd: pytest.CaptureFixture[str]) -> None:
     before = (sys.stdout, sys.stderr)
     threads = threading.active_count()
-    assert main(["explain-emcy", "8611h"]) == ExitCode.OK
+    assert run_verb("explain-emcy", "8611h") == ExitCode.OK
     assert (sys.stdout, sys.stderr) == before
     assert "8611" in capfd.readouterr().out
     _wait_for(lambda: threading.active_count() == threads)

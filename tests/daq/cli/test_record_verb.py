@@ -15,6 +15,7 @@ from daq.log.metadata import RunStatistics
 from daq.workflow.record import Recorded
 from drivers.errors import DriveFault, DriverError, SampleLost
 from drivers.stream.answers import StreamStatistics
+from tests.daq.command_line import run_verb
 
 
 @pytest.fixture
@@ -76,7 +77,7 @@ def test_a_recording_with_losses_is_reported_and_is_no_success(
     ]
     assert main(command) == code
     assert said in capsys.readouterr().out
-    assert main([*command, "--json"]) == code
+    assert run_verb(*command, "--json") == code
     document = json.loads(capsys.readouterr().out)
     assert document["valid"] is valid
 
@@ -106,9 +107,12 @@ def test_a_failed_recording_says_what_it_left_and_the_next_one_what_is_in_its_wa
     second = " ".join(capsys.readouterr().err.split())
     assert "the rest of a recording" in second
     for run in (first, second):
-        assert f"`rm {shlex.quote(str(part))}`" in run
-        assert f"`mv {shlex.quote(str(part))} " in run
-        assert f"`drivegain salvage {shlex.quote(str(part))} --out " in run
+        expected = f"`rm {shlex.quote(str(part))}`"
+        assert expected in run
+        expected = f"`mv {shlex.quote(str(part))} "
+        assert expected in run
+        expected = f"`drivegain salvage {shlex.quote(str(part))} --out "
+        assert expected in run
         assert "choose another --out" in run
 
 
@@ -123,10 +127,8 @@ def test_a_lost_sample_of_a_real_cell_does_not_name_lockstep(
     real.write_text(text.replace("interface: virtual", "interface: socketcan"))
     error = SampleLost(7, (0,), ("J1 (node 1)",))
     monkeypatch.setattr("daq.workflow.record.record", _failing(error, None))
-    assert (
-        main(["record", str(real), "plan.yaml", "--out", str(tmp_path / "run.mcap")])
-        == ExitCode.DEVICE_FAULT
-    )
+    code = run_verb("record", real, "plan.yaml", "--out", tmp_path / "run.mcap")
+    assert code == ExitCode.DEVICE_FAULT
     error_output = capsys.readouterr().err
     output = " ".join(error_output.split())
     assert "hint: check the load of bus and computer" in output

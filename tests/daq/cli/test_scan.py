@@ -38,6 +38,7 @@ from drivers.simulation.cell import SimulatedCell
 from drivers.simulation.drive import ErrorCode, PowerState
 from drivers.simulation.spec import SdoAbort
 from ident.model.model import DriveTrain
+from tests.daq.command_line import run_verb
 from tests.faults.test_scenario import PLAN
 from tests.two_buses import on_two_buses
 
@@ -96,16 +97,15 @@ def test_a_narrow_terminal_gets_every_column_and_whole_words(cell: Cell) -> None
         assert max(cell_len(line.rstrip()) for line in text.splitlines()) <= width
         assert text.count("ENABLED") == 6
         assert text.count("pre-operational") == 6
-        assert all(str(1000 + number) in text for number in range(1, 7))
+        for number in range(1, 7):
+            assert str(1000 + number) in text
 
 
 def test_a_virtual_bus_without_a_cell_names_the_simulation(
     checkout: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert (
-        main(["scan", str(checkout / "configs/cells/five-bar.yaml"), "--wait", "0.05"])
-        == ExitCode.DEVICE_FAULT
-    )
+    code = run_verb("scan", checkout / "configs/cells/five-bar.yaml", "--wait", "0.05")
+    assert code == ExitCode.DEVICE_FAULT
     said = capsys.readouterr().err
     assert "start `drivegain simulate five-bar`" in said
     assert "wiring" not in said
@@ -122,7 +122,7 @@ def test_a_scan_without_answers_does_not_advise_a_scan(
         open_bus(bus_address(cell)) as bus,
         SimulatedCell(load_simulation(shipped_simulation("clean")), bus),
     ):
-        assert main(["scan", str(file), "--json"]) == ExitCode.DEVICE_FAULT
+        assert run_verb("scan", file, "--json") == ExitCode.DEVICE_FAULT
     failure = json.loads(capsys.readouterr().err)
     assert failure["kind"] == "NodeMissing"
     assert "wiring and termination" in failure["do"]
@@ -238,7 +238,7 @@ def test_a_drive_without_an_object_of_its_profile_is_found_on_the_bus(
             return sound(index, subindex)
 
         monkeypatch.setattr(server, "_read", read)
-        assert main(["scan", str(checkout / "configs/cells/demo.yaml"), "--json"]) == ExitCode.OK
+        assert run_verb("scan", checkout / "configs/cells/demo.yaml", "--json") == ExitCode.OK
     printed = capsys.readouterr().out
     rows = json.loads(printed)["nodes"]
     expected = ["ok", "ok", "profile does not fit", "ok", "ok", "ok"]
@@ -273,12 +273,12 @@ def test_a_drive_with_a_vendor_alone_passes_a_cell_without_its_product_and_seria
 
         monkeypatch.setattr(server, "_read", read)
         file.write_text(vendor_alone)
-        assert main(["scan", str(file)]) == ExitCode.OK
+        assert run_verb("scan", file) == ExitCode.OK
         assert "Next: drivegain calibrate" in capsys.readouterr().err
         file.write_text(declared)
         # The scan has done its work: the exit code stays, and the text says that `record` will
         # refuse.
-        assert main(["scan", str(file)]) == ExitCode.OK
+        assert run_verb("scan", file) == ExitCode.OK
         shown = capsys.readouterr()
     assert "J5 (node 5): serial number 1018h:04 is not reported" in shown.out
     assert f"J5 (node 5): {OTHER_DRIVE}" in shown.out
@@ -297,13 +297,13 @@ def test_a_fault_is_reset_when_a_person_says_so_and_nothing_gets_power(
     spec = load_simulation(shipped_simulation("clean"))
     with open_bus(bus_address(cell)) as bus, SimulatedCell(spec, bus) as simulated:
         simulated.nodes[2].drive.fail(ErrorCode.FOLLOWING_ERROR)
-        assert main(["scan", file]) == ExitCode.OK
+        assert run_verb("scan", file) == ExitCode.OK
         shown = capsys.readouterr().out
         assert "in fault" in shown
         assert "--reset-faults" in shown
         drive = simulated.nodes[2].drive
         assert drive.state is PowerState.FAULT
-        assert main(["scan", file, "--reset-faults", "--json"]) == ExitCode.OK
+        assert run_verb("scan", file, "--reset-faults", "--json") == ExitCode.OK
         document = json.loads(capsys.readouterr().out)
         assert document["reset"] == ["J3"]
         assert document["faults"]["J3"].startswith("8611h: ")
@@ -313,7 +313,7 @@ def test_a_fault_is_reset_when_a_person_says_so_and_nothing_gets_power(
         expected = [PowerState.SWITCH_ON_DISABLED] * 6
         assert states == expected
         # Asked of a cell without a fault it does nothing.
-        assert main(["scan", file, "--reset-faults"]) == ExitCode.OK
+        assert run_verb("scan", file, "--reset-faults") == ExitCode.OK
         assert "was reset" not in capsys.readouterr().out
 
 
@@ -345,10 +345,10 @@ def test_a_mistyped_nameplate_is_reported_with_its_line(
     axes = (first, spec.axes[1], third, *spec.axes[3:])
     spec = replace(spec, axes=axes)
     with open_bus(bus_address(cell)) as bus, SimulatedCell(spec, bus):
-        assert main(["scan", str(file)]) == ExitCode.OK
+        assert run_verb("scan", file) == ExitCode.OK
         shown = capsys.readouterr()
         (configs / "controllers/demo.yaml").unlink()
-        assert main(["scan", str(file), "--json"]) == ExitCode.OK
+        assert run_verb("scan", file, "--json") == ExitCode.OK
         document = json.loads(capsys.readouterr().out)
     assert (
         f"demo.yaml:{line}: axes[2].nameplate_gain_nm_per_a: found 25650 Nm/A, while the current "
@@ -386,9 +386,9 @@ def scan_edited(
         open_bus(bus_address(cell)) as bus,
         SimulatedCell(load_simulation(shipped_simulation("clean")), bus),
     ):
-        assert main(["scan", str(file), "--json"]) == ExitCode.OK
+        assert run_verb("scan", file, "--json") == ExitCode.OK
         document = json.loads(capsys.readouterr().out)
-        assert main(["scan", str(file)]) == ExitCode.OK
+        assert run_verb("scan", file) == ExitCode.OK
         shown = capsys.readouterr()
     assert "Next" not in shown.err
     return document, shown.out
@@ -484,7 +484,7 @@ def test_a_file_without_any_node_id_is_refused_as_before(
     file = configs / "cells/demo.yaml"
     changed_text = file.read_text().replace("node_id: ", "node: ")
     file.write_text(changed_text)
-    assert main(["scan", str(file), "--json"]) == ExitCode.CONFIGURATION
+    assert run_verb("scan", file, "--json") == ExitCode.CONFIGURATION
     failure = json.loads(capsys.readouterr().err)
     assert failure["kind"] == "SchemaMismatch"
     assert "did you mean that?" in failure["found"]
@@ -515,12 +515,13 @@ def test_a_scan_while_a_recorder_has_the_bus_is_refused_like_a_second_recording(
         open_bus(bus_address(cell)) as witness,
     ):
         with bus_lock(cell):
-            assert main(["scan", file, "--json", *options]) == ExitCode.BUS_TAKEN
+            assert run_verb("scan", file, "--json", *options) == ExitCode.BUS_TAKEN
         failure = json.loads(capsys.readouterr().err)
-        assert (failure["kind"], failure["exit_code"]) == ("BusTaken", ExitCode.BUS_TAKEN)
+        assert failure["kind"] == "BusTaken"
+        assert failure["exit_code"] == ExitCode.BUS_TAKEN
         assert "such as a recording" in failure["found"]
         assert sent_requests(witness) == []
-        assert main(["scan", file, *options]) == ExitCode.OK
+        assert run_verb("scan", file, *options) == ExitCode.OK
 
 
 def test_a_scan_beside_a_master_whose_lock_is_not_seen_sends_nothing(

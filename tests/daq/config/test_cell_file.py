@@ -67,7 +67,8 @@ def test_the_demo_cell_is_read_in_si_units(checkout: Path) -> None:
     assert profile is not None
     object_entry = ObjectEntry(0x6074, 0, 16, signed=True)
     assert profile.current == object_entry
-    assert (profile.amplitude, profile.tap) == (Amplitude.RMS, TapPoint.REFERENCE)
+    assert profile.amplitude == Amplitude.RMS
+    assert profile.tap == TapPoint.REFERENCE
     node_ids = [axis.node_id for axis in drive_axes(cell)]
     assert node_ids == [1, 2, 3, 4, 5, 6]
     assert bus_address(cell).interface == "virtual"
@@ -491,7 +492,8 @@ def test_a_list_of_one_bus_is_one_bus(configurations: Path) -> None:
         _spoil(_spoil(listed, "  channel: demo", "    channel: demo"), "  bitrate", "    bitrate")
     )
     assert cell_address(cell) == BusAddress("virtual", "demo")
-    assert {axis.bus for axis in cell.axes} == {"main"}
+    buses = {axis.bus for axis in cell.axes}
+    assert buses == {"main"}
 
 
 @pytest.mark.parametrize(
@@ -624,7 +626,8 @@ def test_joints_that_are_no_axes_are_held(with_gripper: Path) -> None:
     flange = read_urdf(urdf)
     carrying = read_urdf(cell.urdf)
     last_body = carrying.bodies[-1]
-    assert last_body.mass_kg == pytest.approx(flange.bodies[-1].mass_kg + 0.3)
+    mass_kg = flange.bodies[-1].mass_kg
+    assert last_body.mass_kg == pytest.approx(mass_kg + 0.3)
     assert '<origin xyz="0.0 0.0 0.1" rpy="0.0 0.5235987755982988 0.0" />' in cell.urdf
     assert '<origin xyz="0.0 0.02 0.0"' in cell.urdf
     logged = cell_from_bundle(bundle(with_gripper))
@@ -671,7 +674,8 @@ def test_a_joint_that_mimics_an_axis_follows_it(configurations: Path) -> None:
     model = model_of(cell)
     assert cell.place_names == cell.axis_names
     expected = [joint.name for joint in model.robot.axes]
-    assert [joint.name for joint in model.robot.places] == expected
+    names = [joint.name for joint in model.robot.places]
+    assert names == expected
     assert joint_names(cell) == ("J1", "J2", "J3", "J4", "J5", "J6")
     (coupling,) = model.robot.couplings
     assert model.robot.joints[coupling.follower].name == "rod"

@@ -259,10 +259,13 @@ def test_the_payload_of_a_serial_robot_may_hang_on_any_link_that_moves(tmp_path:
         path.write_text(
             text.replace("robot:\n", f"robot:\n  platform: {name}\n", 1), encoding="utf-8"
         )
+        pattern = (
+            rf"robot\.platform: found {found}; expected a "
+            r"link that mov"
+        )
         with pytest.raises(
             ConfigurationInconsistent,
-            match=rf"robot\.platform: found {found}; expected a "
-            r"link that mov",
+            match=pattern,
         ):
             load_cell(path)
 
@@ -331,7 +334,8 @@ def test_a_payload_is_drawn_in_the_frame_of_the_platform(tmp_path: Path) -> None
     bodies = read_urdf(f"{start}</link>{rest}").bodies
     bare = bodies[1]
     loaded = read_urdf(f"{start}{body}{rest}").bodies[1]
-    (tmp_path / "robot.urdf").write_text(f"{start}</link>{rest}", encoding="utf-8")
+    text = f"{start}</link>{rest}"
+    (tmp_path / "robot.urdf").write_text(text, encoding="utf-8")
     listed = f"    centre_m: {list(centre)}\n    inertia_kg_m2: {list(inertia)}\n"
     cell = _cell(
         tmp_path,
@@ -340,7 +344,8 @@ def test_a_payload_is_drawn_in_the_frame_of_the_platform(tmp_path: Path) -> None
     )
     known = cell.payloads[0].drawn.known
     expected = loaded.parameters - bare.parameters
-    assert_allclose([known[name] for name in LINK_PARAMETERS], expected, rtol=1e-9, atol=1e-12)
+    actual = [known[name] for name in LINK_PARAMETERS]
+    assert_allclose(actual, expected, rtol=1e-9, atol=1e-12)
     assert not np.allclose([known["mx"], known["my"], known["mz"]], 5.1 * np.array(centre))
 
 

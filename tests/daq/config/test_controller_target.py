@@ -33,13 +33,12 @@ def test_keys_may_have_a_factor_and_the_file_a_format(tmp_path: Path) -> None:
     controller = f"{{file: robot.cfg, format: xml, gains: {KEYS}}}"
     cell = _cell(tmp_path, controller)
     assert cell.controller is not None
-    assert (cell.controller.file, cell.controller.format) == ("robot.cfg", ControllerFormat.XML)
+    assert cell.controller.file == "robot.cfg"
+    assert cell.controller.format == ControllerFormat.XML
     expected = ("a", "b", "c", "d", "e", "f")
     assert cell.controller.keys == expected
-    assert (cell.controller.factors, cell.controller.objects) == (
-        (1.0, 1000.0, -1.0, 1.0, 1.0, 1.0),
-        (),
-    )
+    assert cell.controller.factors == (1.0, 1000.0, -1.0, 1.0, 1.0, 1.0)
+    assert cell.controller.objects == ()
     assert cell.controller_path == tmp_path / "robot.cfg"
 
 
@@ -114,7 +113,8 @@ def test_a_parameter_holds_the_nearest_number_or_refuses(kind: ParameterKind, va
         packed = struct.pack("<f", value)
         assert packed == struct.pack("<I", word)
         difference = abs(held - value)
-        assert difference <= 6e-8 * abs(value) + 1e-45
+        limit = 6e-8 * abs(value) + 1e-45
+        assert difference <= limit
     else:
         assert held == round(value)
     assert parameter.word(held) == word

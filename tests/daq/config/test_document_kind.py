@@ -115,9 +115,8 @@ def test_shipped_files_are_of_one_kind_each() -> None:
 
 
 def test_what_is_no_document_of_ours_has_no_kind(tmp_path: Path) -> None:
-    assert set(KEYS) | set(FORMATS.values()) | {DocumentKind.LOG, DocumentKind.URDF} == set(
-        DocumentKind
-    )
+    found = set(KEYS) | set(FORMATS.values()) | {DocumentKind.LOG, DocumentKind.URDF}
+    assert found == set(DocumentKind)
     assert kind_of_file(tmp_path) is None
     path = tmp_path / "missing.yaml"
     assert kind_of_file(path) is None

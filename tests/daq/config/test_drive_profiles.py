@@ -142,15 +142,15 @@ def test_a_raw_unit_is_so_many_ampere(name: str) -> None:
     value, ampere = EXPECTED[name]
     scale = profile_of(name).current_scale
     assert len(scale.objects) == (value is not None)
-    assert scale.ampere_per_unit(() if value is None else (value,)) == pytest.approx(
-        ampere, rel=1e-12
-    )
+    found = scale.ampere_per_unit(() if value is None else (value,))
+    assert found == pytest.approx(ampere, rel=1e-12)
 
 
 def test_the_terminal_of_2002h_54_divides_by_root_two() -> None:
     scale = profile_of("beckhoff-el72x1").current_scale
     assert str(scale.switch) == "2002h:54"
-    assert scale.ampere_per_unit((2000,), 0) == pytest.approx(0.002 / math.sqrt(2))
+    expected = 0.002 / math.sqrt(2)
+    assert scale.ampere_per_unit((2000,), 0) == pytest.approx(expected)
     assert scale.ampere_per_unit((2000,), 1) == pytest.approx(0.002)
 
 
@@ -513,9 +513,8 @@ def recorded(
         bus.shutdown()
     assert done.log.valid, done.log.reason
     run, _ = load_run(done.path)
-    return RecordedRun(
-        cell_file, cell, done.path, run, *(np.array(column) for column in zip(*seen, strict=True))
-    )
+    columns = zip(*seen, strict=True)
+    return RecordedRun(cell_file, cell, done.path, run, *(np.array(column) for column in columns))
 
 
 @pytest.mark.slow

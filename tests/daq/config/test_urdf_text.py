@@ -42,7 +42,8 @@ def test_names_stay_apart_without_a_declaration_and_with_a_wrong_one_of_utf_8(
 
 def test_lines_before_the_declaration_are_left_out() -> None:
     text = _declaration("UTF-8") + ROBOT
-    assert urdf_text(b"\n  \n" + text.encode(), "arm.urdf") == text
+    data = b"\n  \n" + text.encode()
+    assert urdf_text(data, "arm.urdf") == text
 
 
 @pytest.mark.parametrize(

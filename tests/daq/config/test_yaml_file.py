@@ -130,7 +130,8 @@ def test_the_remedy_names_a_page_with_every_key(model: type[StrictModel], checko
     with pytest.raises(SchemaMismatch) as caught:
         read_model(parse_yaml(b"colour: red\n", "file.yaml"), model)
     page = checkout / "docs/reference" / model.reference
-    assert f"docs/reference/{page.name} has every key" in caught.value.remedy
+    expected = f"docs/reference/{page.name} has every key"
+    assert expected in caught.value.remedy
     text = page.read_text(encoding="utf-8")
     assert re.search("^<!-- generated: (cell file|schemas) -->$", text, re.MULTILINE)
 
@@ -225,7 +226,8 @@ def test_of_a_file_that_is_too_large_little_is_read(tmp_path: Path) -> None:
     path = tmp_path / "large.yaml"
     with path.open("wb") as stream:
         stream.truncate(2**40)  # a hole: it would fill the memory, not the disk
-    with pytest.raises(ConfigurationMissing, match=f"more than {MAX_BYTES} bytes"):
+    pattern = f"more than {MAX_BYTES} bytes"
+    with pytest.raises(ConfigurationMissing, match=pattern):
         read_yaml_bytes(path)
     with path.open("wb") as stream:
         stream.truncate(MAX_BYTES)

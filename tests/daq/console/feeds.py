@@ -51,7 +51,9 @@ def predicting_calibration() -> Calibration:
     each = {"Ia": 1.0, "fv": 3.0, "off": 0.5}
     parameters: list[Parameter] = []
     for name, value in each.items():
-        of_axes = [Parameter(f"{name}{axis}", value / axis, 0.1, "SI") for axis in range(1, 7)]
+        of_axes = []
+        for axis in range(1, 7):
+            of_axes.append(Parameter(f"{name}{axis}", value / axis, 0.1, "SI"))
         parameters.extend(of_axes)
     parameter = Parameter("my3", -1.0, 0.1, "kg m")
     gravity = Parameter("mx2", 2.0, 0.1, "kg m"), parameter

@@ -49,27 +49,35 @@ def _run(cell: Cell, **changed: Any) -> dict[str, Any]:
     return {"run": {**asdict(facts(cell, Path("run.mcap"))), **changed}}
 
 
-UNFIT: dict[str, Callable[[Cell], bytes]] = {
-    "one byte": lambda _: b"x",
-    "no JSON": lambda _: HEAD.pack(TEXT, 0, 0, 0, 0, 0) + b"{",
-    "a list": lambda _: _text([1]),
-    "an unknown packet": lambda _: HEAD.pack(7, 0, 0, 0, 0, 0),
-    "an unknown event": lambda _: _text({"events": [{**EVENT, "kind": "surprise"}]}),
-    "an event of axis 9": lambda _: _text({"events": [{**EVENT, "axis": 9}]}),
-    "a run without a key": lambda cell: _text(
-        {"run": {k: v for k, v in _run(cell)["run"].items() if k != "moves"}}
-    ),
-    "a run of five axes": lambda cell: _text(
-        {"run": asdict(facts(replace(cell, axes=cell.axes[:5]), None))}
-    ),
-    "a run of no rate": lambda cell: _text(_run(cell, rate_hz=0.0)),
-    "a run with a short list": lambda cell: _text(_run(cell, rad_per_count=[1.0])),
-    "too many samples": lambda cell: _samples(len(cell.axes), 2),
-    "samples of fewer axes": lambda cell: _samples(len(cell.axes) - 1, 1),
-}
-
-
-@pytest.mark.parametrize("packet", UNFIT.values(), ids=UNFIT.keys())
+@pytest.mark.parametrize(
+    "packet",
+    [
+        pytest.param(lambda _: b"x", id="one byte"),
+        pytest.param(lambda _: HEAD.pack(TEXT, 0, 0, 0, 0, 0) + b"{", id="no JSON"),
+        pytest.param(lambda _: _text([1]), id="a list"),
+        pytest.param(lambda _: HEAD.pack(7, 0, 0, 0, 0, 0), id="an unknown packet"),
+        pytest.param(
+            lambda _: _text({"events": [{**EVENT, "kind": "surprise"}]}), id="an unknown event"
+        ),
+        pytest.param(lambda _: _text({"events": [{**EVENT, "axis": 9}]}), id="an event of axis 9"),
+        pytest.param(
+            lambda cell: _text(
+                {"run": {k: v for k, v in _run(cell)["run"].items() if k != "moves"}}
+            ),
+            id="a run without a key",
+        ),
+        pytest.param(
+            lambda cell: _text({"run": asdict(facts(replace(cell, axes=cell.axes[:5]), None))}),
+            id="a run of five axes",
+        ),
+        pytest.param(lambda cell: _text(_run(cell, rate_hz=0.0)), id="a run of no rate"),
+        pytest.param(
+            lambda cell: _text(_run(cell, rad_per_count=[1.0])), id="a run with a short list"
+        ),
+        pytest.param(lambda cell: _samples(len(cell.axes), 2), id="too many samples"),
+        pytest.param(lambda cell: _samples(len(cell.axes) - 1, 1), id="samples of fewer axes"),
+    ],
+)
 def test_a_packet_that_does_not_fit_is_one_kind_of_error(
     cell: Cell, cell_file: Path, packet: Callable[[Cell], bytes]
 ) -> None:
@@ -136,7 +144,8 @@ def test_a_recorder_of_another_version_is_said_and_the_next_one_is_shown(
             assert facts_of_recorder(cell_file, 10.0) is None  # monitor goes on with its own
             assert live.phase == "running"  # so that the page's button can stop it
         live.wait(lambda: live.phase == "ended")
-        assert live.end is not None and not live.end["axes_stopped"]
+        assert live.end is not None
+        assert not live.end["axes_stopped"]
         assert live.status()["alarm"] == ""
         feed = Feed(cell_file, lambda: None)
         accepted = arrivals(feed)
@@ -146,7 +155,9 @@ def test_a_recorder_of_another_version_is_said_and_the_next_one_is_shown(
             recording.run(100)
             live.wait(lambda: live.samples == 100)
             status = live.status()
-            assert (status["phase"], status["end"], status["alarm"]) == ("running", None, "")
+            assert status["phase"] == "running"
+            assert status["end"] is None
+            assert status["alarm"] == ""
 
 
 def test_a_background_task_that_ends_is_said(cell: Cell, cell_file: Path) -> None:
@@ -180,12 +191,15 @@ def test_a_recorder_that_hangs_is_said_and_its_states_are_marked_as_old(
         so_far = 10 * number
         live.take(_samples(len(cell.axes), 1, so_far=so_far))
     fresh = live.status()
-    assert (fresh["alarm"], fresh["old"], fresh["rate_hz"] > 0.0) == ("", False, True)
+    assert fresh["alarm"] == ""
+    assert fresh["old"] is False
+    assert fresh["rate_hz"] > 0.0
     now_s[0] += 4.1
     old = live.status()
     assert "Nothing has come for 4 s" in old["alarm"]
     assert "use the emergency stop" in old["alarm"]
-    assert (old["old"], old["rate_hz"]) == (True, 0.0)
+    assert old["old"] is True
+    assert old["rate_hz"] == 0.0
     live.take(_samples(len(cell.axes), 1, so_far=91))
     assert live.status()["old"] is False
     message = {"result": {"valid": True, "reason": "", "samples": 91}}
@@ -208,7 +222,8 @@ def test_a_stop_is_forgotten_when_the_next_recorder_begins(cell: Cell, cell_file
                 recording.run(100)
                 live.wait(lambda: live.samples == 100 and live.stop_state is None)
                 path = f"/{TOKEN}/stop"
-                document = json.loads(console.ask(path, "POST", origin=own)[1])
+                text = console.ask(path, "POST", origin=own)[1]
+                document = json.loads(text)
                 assert document["accepted"]
                 assert asked.wait(30), number
             live.wait(lambda: bool(live.stop_state and live.stop_state.get("axes_stopped")))
@@ -251,4 +266,5 @@ def test_the_sample_rate_is_that_of_the_cells_own_time(
     measured = live.rate_hz
     assert measured > 1.2 * live.run.rate_hz
     rate_hz = live.status()["rate_hz"]
-    assert rate_hz == (live.run.rate_hz if pacing is PacingMode.LOCKSTEP else round(measured, 1))
+    expected = live.run.rate_hz if pacing is PacingMode.LOCKSTEP else round(measured, 1)
+    assert rate_hz == expected

@@ -16,7 +16,6 @@ from pathlib import Path
 import pytest
 
 from daq.advice import for_command_line
-from daq.cli.app import main
 from daq.config.cell import Cell
 from daq.config.cell_file import load_cell
 from daq.config.same_cell import calibrated_robot
@@ -31,6 +30,7 @@ from drivers.canopen.emcy import remedy_of
 from drivers.messages import CellEvent, EventKind
 from ident.calibration import Calibration
 from tests.daq.calibrations import demo_calibration
+from tests.daq.command_line import run_verb
 from tests.daq.console.feeds import TOKEN, Recording, Served, arrivals, served
 from tests.daq.histories import calibration_of, enter, ledger_of
 
@@ -51,9 +51,9 @@ def test_the_page_loads_nothing_from_elsewhere_and_runs_no_inline_script(console
     answer, page = console.ask(path)
     assert answer.status == 200
     policy = answer.headers["content-security-policy"]
-    assert (
-        "default-src 'none'" in policy and "script-src 'self'" in policy and "unsafe" not in policy
-    )
+    assert "default-src 'none'" in policy
+    assert "script-src 'self'" in policy
+    assert "unsafe" not in policy
     assert answer.headers["referrer-policy"] == "no-referrer"
     assert "server" not in answer.headers
     for name in re.findall(rb'(?:src|href)="([^"]+)"', page):
@@ -115,8 +115,11 @@ def test_another_origin_can_neither_read_nor_stop(console: Served) -> None:
 )  # fmt: skip
 def test_no_path_leads_to_a_file(console: Served, path: str) -> None:
     answer, content = console.ask(f"/{TOKEN}/{path}")
-    assert b"secret" not in content and b"root:" not in content and b"[project]" not in content
-    assert answer.status == (200 if path.startswith("report?") else 404)
+    assert b"secret" not in content
+    assert b"root:" not in content
+    assert b"[project]" not in content
+    expected = 200 if path.startswith("report?") else 404
+    assert answer.status == expected
 
 
 def test_the_report_runs_no_script(console: Served) -> None:
@@ -174,7 +177,8 @@ def test_a_monitor_is_shown_until_a_recorder_begins_and_again_after_it(
         assert accepted.wait(30)
         monitor.run(100)
         live.wait(lambda: live.samples == 100)
-        assert (live.phase, live.run is not None and live.run.log) == ("watching", None)
+        assert live.phase == "watching"
+        assert (live.run is not None and live.run.log) is None
         shown = live.status()
         state = shown["axes"][0]["state"]
         assert state == "OPERATION ENABLED"
@@ -202,7 +206,8 @@ def test_a_monitor_is_shown_until_a_recorder_begins_and_again_after_it(
         monitor.run(100)
         live.wait(lambda: live.phase == "watching" and live.samples == 200)
         # How the recording ended stays on the page; the monitor's end does not replace it.
-        assert (live.end or {})["ok"] and (live.result or {})["valid"]
+        assert (live.end or {})["ok"]
+        assert (live.result or {})["valid"]
         cell_event = CellEvent(0, 2, EventKind.EMCY, 0x7305, "J3 (node 3): EMCY 7305h")
         watching.event(cell_event)
         live.wait(lambda: live.events.end == 1)
@@ -231,7 +236,8 @@ def test_more_pages_than_are_served_are_refused_also_at_once(console: Served) ->
     with ExitStack() as closing:
         pages = [closing.enter_context(console.reader()) for _ in range(3 * LARGEST_READERS)]
         answers = [closing.enter_context(page.makefile("rb")).readline() for page in pages]
-    assert sum(b" 200 " in line for line in answers) == LARGEST_READERS
+    found = sum(b" 200 " in line for line in answers)
+    assert found == LARGEST_READERS
     assert sum(b" 503 " in line for line in answers) == 2 * LARGEST_READERS
 
 
@@ -252,7 +258,8 @@ def test_a_damaged_audit_log_is_a_problem_of_the_history_on_the_page(tmp_path: P
     history = results.document()["history"]
     assert history["problem"] is None
     lines = ledger.audit.read_bytes().splitlines(keepends=True)
-    ledger.audit.write_bytes(b"".join(lines[1:]))
+    content = b"".join(lines[1:])
+    ledger.audit.write_bytes(content)
     shown = results.document()["history"]
     assert shown["problem"] == MAY_LACK
     assert shown["calibrations"] == 1
@@ -315,6 +322,7 @@ def test_a_named_file_that_does_not_exist_is_an_error(
     missing = tmp_path / "missing.yaml"
     cells_folder = checkout / "configs" / "cells"
     demo_path = cells_folder / "demo.yaml"
-    assert main(["console", str(demo_path), option, str(missing)]) != ExitCode.OK
+    assert run_verb("console", demo_path, option, missing) != ExitCode.OK
     error = capsys.readouterr().err
-    assert all(word in error for word in ("missing.yaml", "found", "expected"))
+    for word in ("missing.yaml", "found", "expected"):
+        assert word in error

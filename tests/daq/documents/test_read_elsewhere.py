@@ -28,7 +28,8 @@ def test_the_ten_lines_of_the_page_read_every_gain_and_parameter(
     checkout: Path, tmp_path: Path
 ) -> None:
     small = Parameter("Ixx2 - 0.5*Iyy2", 3e-05, 1e-6, "kg m²")
-    calibration = replace(demo_calibration(), parameters=(*demo_calibration().parameters, small))
+    parameters = (*demo_calibration().parameters, small)
+    calibration = replace(demo_calibration(), parameters=parameters)
     save_calibration(calibration, tmp_path / "calibration.yaml")
     (code,) = re.findall(r"```python\n(.*?)```", _page(checkout), re.DOTALL)
     assert len([line for line in code.splitlines() if line]) <= 10

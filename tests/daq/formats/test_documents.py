@@ -108,7 +108,8 @@ def _json_cases(draw: st.DrawFn) -> _Case:
             return draw(st.sampled_from(["true", "null"]))
         return draw(_numbers)
 
-    head = draw(st.sampled_from(["", "\ufeff", " ", end]))
+    strategy = st.sampled_from(["", "\ufeff", " ", end])
+    head = draw(strategy)
     text = head + value((), 0) + draw(gap)
     return _case(text, numbers, keys)
 
@@ -165,7 +166,8 @@ def _xml_cases(draw: st.DrawFn) -> _Case:
             before = draw(st.sampled_from([" ", end]))
             hole = number(path + "/@gain")
             attributes += f"{before}gain{space}={space}{quote}{space}{hole}{space}{quote}"
-        attributes += draw(st.sampled_from(["", " ", " note='a>b'", f"{end}x='&lt;7'"]))
+        strategy = st.sampled_from(["", " ", " note='a>b'", f"{end}x='&lt;7'"])
+        attributes += draw(strategy)
         shape = draw(
             st.sampled_from(["number", "text", "empty", *(["elements"] if depth < 3 else [])])
         )
@@ -230,7 +232,8 @@ def _dcf_cases(draw: st.DrawFn) -> _Case:
                 f"{draw(st.sampled_from(['ParameterValue', 'parametervalue']))}{space}={space}{_HOLE}{space}"  # noqa: E501
             )
         lines += draw(st.sampled_from([[], [""], ["PDOMapping=0"], ["Denotation=32.96"]]))
-    text = end.join(lines) + draw(st.sampled_from(["", end]))
+    strategy = st.sampled_from(["", end])
+    text = end.join(lines) + draw(strategy)
     return _case(text, numbers, keys, "iso-8859-1")
 
 
@@ -242,16 +245,17 @@ CASES = {
 
 
 def _json_tree(content: bytes) -> object:
-    return json.loads(content.decode("utf-8-sig"), parse_float=float, parse_int=float)
+    text = content.decode("utf-8-sig")
+    return json.loads(text, parse_float=float, parse_int=float)
 
 
 def _xml_tree(content: bytes) -> object:
     target = ElementTree.TreeBuilder(insert_comments=True, insert_pis=True)
     parser = ElementTree.XMLParser(target=target)
-    return [
-        (e.tag, tuple(sorted(e.attrib.items())), e.text, e.tail)
-        for e in ElementTree.fromstring(content, parser).iter()
-    ]
+    found = []
+    for e in ElementTree.fromstring(content, parser).iter():
+        found.append((e.tag, tuple(sorted(e.attrib.items())), e.text, e.tail))
+    return found
 
 
 def _dcf_tree(content: bytes) -> object:
@@ -670,9 +674,8 @@ def test_a_type_is_decimal_or_hexadecimal_digits(entry: str, number: str) -> Non
         DcfDocument("drive.dcf", text).locate(("2003",))
     column = f"{entry}={number}"
     line = text.splitlines().index(column) + 1
-    assert (f"line {line}: '{number}'; expected {entry.lower()} in decimal digits") in str(
-        caught.value
-    )
+    expected = f"line {line}: '{number}'; expected {entry.lower()} in decimal digits"
+    assert expected in str(caught.value)
 
 
 @pytest.mark.parametrize("kind", ["0x0008", "0X8", "8", "0x00000008", "0x11", "17"])
@@ -689,7 +692,8 @@ def test_a_number_of_a_dcf_that_begins_with_zero_is_not_guessed(kind: str, numbe
     dcf_document = DcfDocument("drive.dcf", f"[2003]\nDataType={kind}\nParameterValue={number}\n")
     with pytest.raises(ControllerUnfit) as caught:
         dcf_document.locate(("2003",))
-    assert f"line 3: '{number}'" in str(caught.value)
+    expected = f"line 3: '{number}'"
+    assert expected in str(caught.value)
     assert "octal" in str(caught.value)
     assert "nothing was written" in str(caught.value)
 
@@ -884,9 +888,8 @@ def test_the_comment_behind_a_number_is_that_of_its_line(
 ) -> None:
     rest = text.partition("32.96")[2]
     assert comment_behind(rest, name) == comment
-    as_format = {".yaml": ControllerFormat.YAML, ".xml": ControllerFormat.XML}.get(
-        Path(name).suffix
-    )
+    suffix = Path(name).suffix
+    as_format = {".yaml": ControllerFormat.YAML, ".xml": ControllerFormat.XML}.get(suffix)
     if as_format is not None:
         assert comment_behind(rest, "a.conf", as_format) == comment
 
@@ -908,7 +911,8 @@ def test_keys_of_the_file_may_have_dots(name: str, text: str) -> None:
     keys = ("node.ros__parameters.gains.J1.nm_per_a", "node.ros__parameters.gains.J2.nm_per_a")
     assert [one.value for one in document.locate(keys)] == [32.96, -11.52]
     spelling = {keys[0]: "33.10"}
-    assert document.with_values(spelling).text == text.replace("32.96", "33.10")
+    expected = text.replace("32.96", "33.10")
+    assert document.with_values(spelling).text == expected
 
 
 @pytest.mark.parametrize(

@@ -190,7 +190,8 @@ def test_tabs_behind_a_number_are_read_and_stay(gap: str, behind: str) -> None:
     text = f"J1:\n  gain: 32.96{gap}{behind}\nJ2:\n  gain: -11.52 # tab\tinside\n"
     document = yaml_document(text.encode(), "controller.yaml")
     assert [one.value for one in document.locate(("J1.gain", "J2.gain"))] == [32.96, -11.52]
-    assert document.with_values({"J1.gain": "33.10"}).text == text.replace("32.96", "33.10")
+    expected = text.replace("32.96", "33.10")
+    assert document.with_values({"J1.gain": "33.10"}).text == expected
 
 
 @pytest.mark.parametrize("gap", ["\t", " \t", "\t\t ", " \t \t"])

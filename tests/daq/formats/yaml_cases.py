@@ -47,7 +47,8 @@ class Case:
 @st.composite
 def cases(draw: st.DrawFn) -> Case:
     newline = draw(st.sampled_from(["\n", "\r\n"]))
-    axes = draw(st.lists(_words, min_size=1, max_size=4, unique=True))
+    strategy = st.lists(_words, min_size=1, max_size=4, unique=True)
+    axes = draw(strategy)
     sampled = st.sampled_from([1, 2, 4])
     step = " " * draw(sampled)
     head = draw(
@@ -55,10 +56,11 @@ def cases(draw: st.DrawFn) -> Case:
             ["", "\ufeff", "# a human's file", "---", "%YAML 1.1\n---", "title: 'déjà 漢 😀 vu'"]
         )
     )
-    around = [
-        draw(_elsewhere).replace("|+|", "\0+|").replace("|", newline).replace("\0", "|")
-        for _ in range(2)
-    ]
+    around = []
+    for _ in range(2):
+        around.append(
+            draw(_elsewhere).replace("|+|", "\0+|").replace("|", newline).replace("\0", "|")
+        )
     if around[1]:
         changed_around = around[1].replace("&d", "&e")
         around[1] = changed_around.replace("*d", "*e").replace(": ", "_2: ", 1)
@@ -73,28 +75,33 @@ def cases(draw: st.DrawFn) -> Case:
         quote = draw(_quotes)
         gap = draw(_gaps)
         comment = draw(_comments)
+        block = (
+            f"{step}{axis}:{newline}{step * 2}gain:{gap}",
+            f"{comment}{newline}{step * 2}kp: 32.96{newline}",
+        )
+        last = (
+            f"{step}? {axis}{newline}{step}:{step}gain:{gap}",
+            f"{comment}{newline}# {axis}{newline}",
+        )
+        anchored = (
+            f"{step}{axis}: {{kp: 1, gain: &{'x' * (len(keys) + 1)} ",
+            f"}}{comment}{newline}",
+        )
+        tagged = (
+            f"{step}{axis}:{newline}{step * 2}gain: !!float{gap}",
+            f"{comment}{newline}{newline}",
+        )
+        flow = (f"{step}{axis}: {{gain:{gap}", f" , kp: 7 }}{comment}{newline}")
         before, after = {
-            "block": (
-                f"{step}{axis}:{newline}{step * 2}gain:{gap}",
-                f"{comment}{newline}{step * 2}kp: 32.96{newline}",
-            ),
-            "flow": (f"{step}{axis}: {{gain:{gap}", f" , kp: 7 }}{comment}{newline}"),
+            "block": block,
+            "flow": flow,
             "list": (
                 f"{step}{axis}:{comment}{newline}{step}- 32.96{newline}{step}-{gap}",
                 f"{comment}{newline}",
             ),
-            "anchored": (
-                f"{step}{axis}: {{kp: 1, gain: &{'x' * (len(keys) + 1)} ",
-                f"}}{comment}{newline}",
-            ),
-            "tagged": (
-                f"{step}{axis}:{newline}{step * 2}gain: !!float{gap}",
-                f"{comment}{newline}{newline}",
-            ),
-            "last": (
-                f"{step}? {axis}{newline}{step}:{step}gain:{gap}",
-                f"{comment}{newline}# {axis}{newline}",
-            ),
+            "anchored": anchored,
+            "tagged": tagged,
+            "last": last,
         }[shape]
         pieces[-1] += before + quote
         pieces.append(quote + after)

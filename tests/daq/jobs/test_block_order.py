@@ -52,7 +52,8 @@ def test_the_payload_changes_at_most_every_second_block_after_the_first(number: 
     roles = [fixed_role(one) for one in range(number + 1)]
     loads = [role is not BlockRole.BARE for role in roles]
     changes = sum(one != other for one, other in pairwise(loads))
-    assert changes <= 1 + len(roles) // 2
+    limit = 1 + len(roles) // 2
+    assert changes <= limit
     assert roles.count(BlockRole.HELD_OUT) == (number >= 2)
 
 
@@ -130,7 +131,8 @@ def test_it_is_quicker_than_the_order_that_cancels_drift(ratio: float) -> None:
             break
         last_step = steps[-1]
         steps.append(_with_one_more(last_step, fixed_role(number)))
-    assert _time_s(_recorded(ratio)) < 0.8 * _time_s(steps)
+    limit = 0.8 * _time_s(steps)
+    assert _time_s(_recorded(ratio)) < limit
 
 
 def _until_limit(first_ratio: float, blocks: int, *, is_fixed: bool) -> tuple[float, int]:
@@ -148,7 +150,8 @@ def _until_limit(first_ratio: float, blocks: int, *, is_fixed: bool) -> tuple[fl
         role = fixed_role(block_number)
         if not is_fixed:
             so_far = steps[-1]
-            role = next_role(so_far, quickest_way(steps[-1], ratio, BLOCK_S, blocks - number))
+            way = quickest_way(steps[-1], ratio, BLOCK_S, blocks - number)
+            role = next_role(so_far, way)
         steps.append(_with_one_more(steps[-1], role))
     changes = sum(one.is_mounted != other.is_mounted for one, other in pairwise(steps))
     return _variance(steps[-1]) / target, changes
@@ -160,7 +163,8 @@ def test_at_the_time_limit_sigma_is_no_larger_than_in_the_order_that_cancels_dri
 ) -> None:
     ratio, changes = _until_limit(first_ratio, blocks, is_fixed=False)
     fixed_ratio, _ = _until_limit(first_ratio, blocks, is_fixed=True)
-    assert ratio <= max(fixed_ratio, 1.0) * (1.0 + 1e-6)
+    limit = max(fixed_ratio, 1.0) * (1.0 + 1e-6)
+    assert ratio <= limit
     assert changes <= 1
 
 
@@ -210,4 +214,5 @@ def test_a_session_too_short_for_its_target_keeps_half_of_its_time_for_the_paylo
 
 def test_every_session_begins_with_what_gives_the_gains() -> None:
     assert first_blocks(1) == FIRST_BLOCKS
-    assert first_blocks(3) == (BlockRole.BARE, BlockRole.BARE, *FIRST_BLOCKS)
+    expected = (BlockRole.BARE, BlockRole.BARE, *FIRST_BLOCKS)
+    assert first_blocks(3) == expected

@@ -85,7 +85,8 @@ def test_a_person_reads_no_keys_and_no_lists_of_python() -> None:
         ": free 500 MB, seconds 30, payload none\n"
     )
     # Programs read the keys as ever.
-    document = json.loads(said(Form.JSON, missing=(0, 0, 0)))
+    text = said(Form.JSON, missing=(0, 0, 0))
+    document = json.loads(text)
     assert document["missing"] == [0, 0, 0]
 
 
@@ -99,7 +100,8 @@ def test_a_person_reads_a_finding_once_in_the_conclusion() -> None:
 
 def test_numbers_that_json_cannot_say_are_null() -> None:
     more = [math.inf, 1.0]
-    document = json.loads(said(Form.JSON, gain=math.nan, more=more))
+    text = said(Form.JSON, gain=math.nan, more=more)
+    document = json.loads(text)
     assert document["more"] == [None, 1.0]
 
 
@@ -116,7 +118,8 @@ def test_the_journal_is_known_by_the_stream_that_systemd_names(tmp_path: Path) -
     path = tmp_path / "stderr"
     with path.open("w") as stream:
         found = os.fstat(stream.fileno())
-        environment = {"JOURNAL_STREAM": f"{found.st_dev}:{found.st_ino}"}
+        JOURNAL_STREAM = f"{found.st_dev}:{found.st_ino}"
+        environment = {"JOURNAL_STREAM": JOURNAL_STREAM}
         assert form_of(stream, environment) is Form.JOURNAL
         # Of a service whose stderr was redirected since.
         form = form_of(stream, {"JOURNAL_STREAM": "1:2"})
@@ -135,7 +138,8 @@ def test_metrics_are_replaced_whole_and_can_be_read_by_the_collector(tmp_path: P
     assert path.name == "drivegain_the_cell__e183a8.prom"
     st_mode = path.stat().st_mode
     assert st_mode & 0o777 == 0o644
-    assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
+    names = [entry.name for entry in tmp_path.iterdir()]
+    assert names == [path.name]
     families = {family.name: family for family in text_string_to_metric_families(path.read_text())}
     samples = families["drivegain_recalibration_outcome"].samples
     outcomes = {s.labels["outcome"]: s.value for s in samples}

@@ -58,6 +58,7 @@ class Recorded:
         current_per_unit = scale.current_per_unit.tolist()
         to_joint = scale.to_joint.tolist()
         offset_rad = scale.offset_rad.tolist()
+        payload = None if log.head.run.payload is None else log.head.run.payload.name
         return RunFacts(
             run_id="id",
             log=str(self.folder / f"{self.block}.mcap"),
@@ -68,7 +69,7 @@ class Recorded:
             current_per_unit=current_per_unit,
             to_joint=to_joint,
             offset_rad=offset_rad,
-            payload=None if log.head.run.payload is None else log.head.run.payload.name,
+            payload=payload,
             bus_load={},
         )
 
@@ -126,8 +127,9 @@ def while_recording(whole_session: tuple[Rig, MadeSession], folder: Path, block:
     names = [one.name for one in state.blocks]
     before = names[: names.index(block)]
     runs = tuple(run for run in state.runs if run.name in before)
+    blocks = tuple(one for one in state.blocks if one.name in (*before, block))
     update = {
-        "blocks": tuple(one for one in state.blocks if one.name in (*before, block)),
+        "blocks": blocks,
         "runs": runs,
         "gains": (),
         "outcome": None,
@@ -313,5 +315,6 @@ def test_a_look_of_another_thread_is_published_with_the_next_samples(tmp_path: P
     expected = [{"quick": asdict(FIGURES)}]
     assert texts == expected
     packets.sample(Sample(1, 1, (0,), (0,), (0,)))
-    assert sum(one[0] == TEXT for one in packets.sent[sent_before:]) == 1
+    found = sum(one[0] == TEXT for one in packets.sent[sent_before:])
+    assert found == 1
     packets.close()

@@ -91,12 +91,12 @@ def test_paths_are_meant_from_the_cell_file(tmp_path: Path) -> None:
 def test_the_page_shows_every_key_and_its_example_is_one() -> None:
     text = DOCUMENT.read_text(encoding="utf-8")
     (example,) = re.findall(r"```yaml\n(recalibration:\n.*?)```", text, re.DOTALL)
-    TypeAdapter(RecalibrationSection).validate_json(
-        json.dumps(yaml.safe_load(example)["recalibration"])
-    )
+    recalibration = yaml.safe_load(example)["recalibration"]
+    TypeAdapter(RecalibrationSection).validate_json(json.dumps(recalibration))
     for section in (RecalibrationSection, PlannedRun):
         for key in fields(section):
-            assert re.search(rf"\b{key.name}:", example), key.name
+            pattern = rf"\b{key.name}:"
+            assert re.search(pattern, example), key.name
 
 
 def test_sessions_are_found_taken_up_and_removed_by_their_age(tmp_path: Path) -> None:

@@ -122,18 +122,19 @@ def test_time_that_is_left_is_that_of_the_worst_gain() -> None:
     gains = [GainSoFar.model_validate(gain) for gain in GAINS]
     path = shipped_configurations() / "cells" / "demo.yaml"
     cell = load_cell(path)
-    blocks = [
-        Block(
-            name=f"block-{number}-{kind}",
-            payload=payload,
-            mass_kg=None,
-            holdout=kind == "held-out",
-            plan="",
+    blocks = []
+    for number, (kind, payload) in enumerate(
+        [("bare", None), ("loaded", "disc"), ("held-out", "disc")], 1
+    ):
+        blocks.append(
+            Block(
+                name=f"block-{number}-{kind}",
+                payload=payload,
+                mass_kg=None,
+                holdout=kind == "held-out",
+                plan="",
+            )
         )
-        for number, (kind, payload) in enumerate(
-            [("bare", None), ("loaded", "disc"), ("held-out", "disc")], 1
-        )
-    ]
     assert motion_left_s(cell, gains, blocks, 30.0) == pytest.approx(180.0)
     assert motion_left_s(cell, gains[:1], blocks, 30.0) == 0.0
     # Three more blocks of each kind, as friction by payload needs no order.
@@ -199,6 +200,7 @@ def state(**changed: object) -> GuidedState:
             name="block-2-loaded", payload="disc", mass_kg=4.59, holdout=False, plan="plan-2.yaml"
         ),
     )
+    runs = tuple(_run(block.name) for block in blocks)
     made = GuidedState(
         session="s",
         cell="demo",
@@ -206,7 +208,7 @@ def state(**changed: object) -> GuidedState:
         began=BEGAN.isoformat(),
         attempt_began=BEGAN.isoformat(),
         blocks=blocks,
-        runs=tuple(_run(block.name) for block in blocks),
+        runs=runs,
     )
     return made.model_copy(update=changed)
 

@@ -17,6 +17,7 @@ import pytest
 from daq.cli.app import main
 from daq.errors import ExitCode
 from daq.jobs.units import Installation, cron_line, unit_name, units_of
+from tests.daq.command_line import run_verb
 from tests.daq.jobs.rig import Rig, make_rig
 
 NAME = "drivegain-recalibrate-demo"
@@ -138,7 +139,7 @@ def test_a_dry_run_shows_and_yes_writes_and_nothing_foreign_is_replaced(
     assert "Dry run" in shown
     assert "ExecStart=" in shown
     assert not folder.exists()
-    assert main([*command, "--yes"]) == ExitCode.OK
+    assert run_verb(*command, "--yes") == ExitCode.OK
     shown = capsys.readouterr().out
     assert f"systemctl enable --now {NAME}.timer" in shown
     changed_shown = shown.replace("'", "")
@@ -146,13 +147,14 @@ def test_a_dry_run_shows_and_yes_writes_and_nothing_foreign_is_replaced(
         "'", ""
     ) in changed_shown
     expected = [f"{NAME}.service", f"{NAME}.timer"]
-    assert sorted(path.name for path in folder.iterdir()) == expected
-    assert main([*command, "--yes", "--schedule", "daily"]) == ExitCode.OK
+    names = sorted(path.name for path in folder.iterdir())
+    assert names == expected
+    assert run_verb(*command, "--yes", "--schedule", "daily") == ExitCode.OK
     text = (folder / f"{NAME}.timer").read_text()
     assert "OnCalendar=daily" in text
     (folder / f"{NAME}.timer").write_text("[Timer]\nOnCalendar=yearly\n")
     before = (folder / f"{NAME}.service").read_bytes()
-    assert main([*command, "--yes"]) == ExitCode.USAGE
+    assert run_verb(*command, "--yes") == ExitCode.USAGE
     assert "did not write" in capsys.readouterr().err
     assert (folder / f"{NAME}.timer").read_text() == "[Timer]\nOnCalendar=yearly\n"
     content = (folder / f"{NAME}.service").read_bytes()
@@ -176,15 +178,13 @@ def test_a_unit_of_an_earlier_version_is_replaced(
 
 
 def test_cron_gets_a_line(rig: Rig, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["schedule", "--cell", str(rig.cell_file), "--cron"]) == ExitCode.OK
+    assert run_verb("schedule", "--cell", rig.cell_file, "--cron") == ExitCode.OK
     line = capsys.readouterr().out
     assert line.startswith("0 0 * * 1  ")
     assert line.rstrip().endswith(f"recalibrate --cell '{rig.cell_file}'")
     assert line.count("\n") == 1
-    assert (
-        main(["schedule", "--cell", str(rig.cell_file), "--cron", "--schedule", "Sun 03:00"])
-        == ExitCode.USAGE
-    )
+    code = run_verb("schedule", "--cell", rig.cell_file, "--cron", "--schedule", "Sun 03:00")
+    assert code == ExitCode.USAGE
 
 
 @pytest.mark.parametrize(
@@ -200,7 +200,8 @@ def test_cron_gets_a_line(rig: Rig, capsys: pytest.CaptureFixture[str]) -> None:
 def test_a_word_means_the_same_date_for_cron_and_for_systemd(
     rig: Rig, word: str, minute: str, hour: str, day_of_month: str, day_of_week: str
 ) -> None:
-    fields = cron_line(installation(rig, schedule=word)).split()[:5]
+    wanted = installation(rig, schedule=word)
+    fields = cron_line(wanted).split()[:5]
     expected = [minute, hour, day_of_month, "*", day_of_week]
     assert fields == expected
 
@@ -211,7 +212,8 @@ def test_names_and_paths_cannot_say_more_than_they_are(rig: Rig) -> None:
     named = replace(rig.cell, name='50 %h "cell"\nExecStart=/bin/false')
     wanted = replace(installation(rig), cell_file=Path("/cells/100 % $HOME/it's.yaml"))
     assert unit_name(named) == "drivegain-recalibrate-50-h-cell-execstart-bin-false-cc6ad2"
-    assert unit_name(rig.cell) == f"drivegain-recalibrate-{rig.cell.name}"
+    expected = f"drivegain-recalibrate-{rig.cell.name}"
+    assert unit_name(rig.cell) == expected
     others = {
         unit_name(replace(rig.cell, name=name))
         for name in ("Пресс 4", "Робот 4", "press 4", "press-4")
@@ -232,18 +234,18 @@ def test_the_unit_of_another_cell_and_a_pipe_are_left_alone(
 ) -> None:
     folder = tmp_path / "units"
     command = ["schedule", "--to", str(folder), "--yes", "--cell"]
-    assert main([*command, str(rig.cell_file)]) == ExitCode.OK
+    assert run_verb(*command, rig.cell_file) == ExitCode.OK
     other = rig.cell_file.with_name("another.yaml")
     shutil.copyfile(rig.cell_file, other)
     before = (folder / f"{NAME}.service").read_bytes()
     capsys.readouterr()
-    assert main([*command, str(other)]) == ExitCode.USAGE
+    assert run_verb(*command, other) == ExitCode.USAGE
     assert "the unit of another cell file" in capsys.readouterr().err
     content = (folder / f"{NAME}.service").read_bytes()
     assert content == before
     (folder / f"{NAME}.service").unlink()
     os.mkfifo(folder / f"{NAME}.service")
-    assert main([*command, str(rig.cell_file)]) == ExitCode.USAGE
+    assert run_verb(*command, rig.cell_file) == ExitCode.USAGE
     assert "did not write" in capsys.readouterr().err
 
 
@@ -260,7 +262,7 @@ def test_a_schedule_that_no_line_can_say_is_refused(
         "--schedule",
         schedule,
     ]
-    assert main([*command, "--yes"]) == ExitCode.USAGE
+    assert run_verb(*command, "--yes") == ExitCode.USAGE
     assert "--schedule" in capsys.readouterr().err
     assert not (tmp_path / "units").exists()
 
@@ -272,10 +274,8 @@ def test_systemd_reads_the_schedule_before_it_is_written(
     rig: Rig, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert (
-        main(["schedule", "--cell", str(rig.cell_file), "--schedule", "every sunday"])
+        run_verb("schedule", "--cell", rig.cell_file, "--schedule", "every sunday")
         == ExitCode.USAGE
     )
     assert "calendar" in capsys.readouterr().err
-    assert (
-        main(["schedule", "--cell", str(rig.cell_file), "--schedule", "Sun 03:00"]) == ExitCode.OK
-    )
+    assert run_verb("schedule", "--cell", rig.cell_file, "--schedule", "Sun 03:00") == ExitCode.OK

@@ -14,6 +14,7 @@ from daq.errors import ExitCode, UsageError
 from daq.simulation.simulation_file import load_simulation, shipped_simulation
 from drivers.simulation.cell import SimulatedCell
 from drivers.simulation.spec import CellSpec
+from tests.daq.command_line import run_verb
 from tests.daq.jobs.rig import make_rig, serving
 from tests.drivers.scripted import FakeClock, ScriptedBus
 
@@ -25,11 +26,12 @@ def test_a_dry_run_says_what_a_job_would_do(
     rig = make_rig(folder, short_plan)
     command = ["recalibrate", "--cell", str(rig.cell_file), "--dry-run"]
     with serving(rig):
-        assert main([*command, "--json"]) == ExitCode.OK
+        assert run_verb(*command, "--json") == ExitCode.OK
         captured = capsys.readouterr()
         steps = json.loads(captured.out)["steps"]
         assert steps[0] == "mount none, record bare-1"
-        levels = [json.loads(line)["level"] for line in captured.err.splitlines()]
+        lines = captured.err.splitlines()
+        levels = [json.loads(line)["level"] for line in lines]
         assert levels == ["info", "info"]
         assert main(command) == ExitCode.OK
     assert "a new session" in capsys.readouterr().out
@@ -42,15 +44,16 @@ def test_a_job_that_is_held_says_so_in_its_exit_code_and_in_json_alone(
     folder = tmp_path / "cell"
     rig = make_rig(folder, short_plan)
     rig.closed.unlink()
-    assert main(["recalibrate", "--cell", str(rig.cell_file)]) == ExitCode.NOT_RELEASED
+    assert run_verb("recalibrate", "--cell", rig.cell_file) == ExitCode.NOT_RELEASED
     captured = capsys.readouterr()
-    events = [json.loads(line) for line in captured.err.splitlines()]
+    lines = captured.err.splitlines()
+    events = [json.loads(line) for line in lines]
     last_event = events[-1]
     assert last_event["error"] == "NotReleased"
     level = events[-1]["level"]
     assert level == "error"
     assert captured.out == ""
-    assert main(["recalibrate", "--cell", str(rig.cell_file), "--json"]) == ExitCode.NOT_RELEASED
+    assert run_verb("recalibrate", "--cell", rig.cell_file, "--json") == ExitCode.NOT_RELEASED
     assert rig.session.state.attempt == 2
 
 
@@ -64,7 +67,7 @@ def test_a_person_at_a_terminal_reads_what_to_do(
     rig = make_rig(folder, short_plan)
     rig.closed.unlink()
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
-    assert main(["recalibrate", "--cell", str(rig.cell_file)]) == ExitCode.NOT_RELEASED
+    assert run_verb("recalibrate", "--cell", rig.cell_file) == ExitCode.NOT_RELEASED
     output = capsys.readouterr().err
     assert "session ended: outcome stopped" in output
     assert " ".join(output.split()).count("close the cell") == 1
@@ -77,7 +80,7 @@ def test_a_cell_without_the_section_names_what_it_lacks(
     cells_folder = checkout / "configs" / "cells"
     cell = cells_folder / "demo.yaml"
     for verb in ("recalibrate", "schedule", "install-units"):
-        assert main([verb, "--cell", str(cell)]) == ExitCode.CONFIGURATION
+        assert run_verb(verb, "--cell", cell) == ExitCode.CONFIGURATION
         assert "recalibration" in capsys.readouterr().err
 
 
@@ -108,7 +111,8 @@ def test_the_simulated_payload_changes_with_the_file_but_never_under_power(
     assert frame() == bare
     file.write_text("disc\n")
     assert frame() == pytest.approx(bare + 4.59)
-    cell.nodes[2].drive.state = cell.nodes[2].drive.state.OPERATION_ENABLED
+    state = cell.nodes[2].drive.state
+    cell.nodes[2].drive.state = state.OPERATION_ENABLED
     file.write_text("none\n")
     assert frame() == pytest.approx(bare + 4.59)
     cell.nodes[2].drive.reset()

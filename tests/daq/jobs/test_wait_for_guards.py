@@ -58,7 +58,8 @@ def _left_after_wait(drives: _Drives) -> tuple[tuple[object, int], ...]:
 def test_a_job_waits_for_the_guard_and_for_the_stop_after_it() -> None:
     drives = _Drives(powered_s=1e9)
     assert _left_after_wait(drives) == (("J2", POWERED),)
-    assert drives.waited_s == pytest.approx(1e-3 * GUARD_MS + STOP_S, abs=0.2)
+    expected = 1e-3 * GUARD_MS + STOP_S
+    assert drives.waited_s == pytest.approx(expected, abs=0.2)
 
 
 def test_a_job_goes_on_as_soon_as_no_axis_has_power() -> None:

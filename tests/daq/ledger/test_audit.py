@@ -201,7 +201,8 @@ def test_a_forged_entry_with_a_right_digest_breaks_the_link(place: int) -> None:
 def test_a_cut_off_tail_is_found_by_who_noted_an_entry_elsewhere(tmp_path: Path) -> None:
     entries = _filled(tmp_path / "a")
     path = tmp_path / "a"
-    content = b"".join(line + b"\n" for line in _lines(path)[:4])
+    lines = _lines(path)[:4]
+    content = b"".join(line + b"\n" for line in lines)
     (tmp_path / "a").write_bytes(content)
     assert verify(tmp_path / "a").holds
     heads = [entries[2].sha256, entries[5].sha256]
@@ -319,7 +320,8 @@ def test_nothing_is_appended_to_a_last_line_that_was_changed(
     path = tmp_path / "a"
     _filled(path, 2)
     first, last = _lines(path)
-    path.write_bytes(first + b"\n" + spoil(last) + b"\n")
+    content = first + b"\n" + spoil(last) + b"\n"
+    path.write_bytes(content)
     spoiled = path.read_bytes()
     with pytest.raises(AuditUnusable, match="line 2, which drivegain did not write"):
         _filled(path, 1)
@@ -330,10 +332,9 @@ def test_nothing_is_appended_to_a_last_line_that_was_changed(
 def _write(
     begun: AuditAction, path: Path, subject: Path, before: bytes, after: bytes
 ) -> AuditEntry:
-    digests = {
-        f"sha256_{name}": hashlib.sha256(b).hexdigest()
-        for name, b in (("before", before), ("after", after))
-    }
+    digests = {}
+    for name, b in (("before", before), ("after", after)):
+        digests[f"sha256_{name}"] = hashlib.sha256(b).hexdigest()
     return append(path, begun, at=NOW, who="K.", subject=str(subject), details=digests)
 
 
@@ -452,9 +453,9 @@ def _append_many(path: Path, who: str) -> None:
 
 def test_many_writers_make_one_chain(tmp_path: Path) -> None:
     context = multiprocessing.get_context("fork")
-    writers = [
-        context.Process(target=_append_many, args=(tmp_path / "a", str(k))) for k in range(4)
-    ]
+    writers = []
+    for k in range(4):
+        writers.append(context.Process(target=_append_many, args=(tmp_path / "a", str(k))))
     for writer in writers:
         writer.start()
     for writer in writers:

@@ -15,6 +15,7 @@ from daq.errors import ExitCode
 from daq.ledger.audit import AuditAction, read
 from daq.ledger.fold import WriteAction
 from tests.daq.calibrations import calibration_for
+from tests.daq.command_line import run_verb
 from tests.daq.histories import history_of
 
 
@@ -22,8 +23,8 @@ from tests.daq.histories import history_of
 def applied(cell_file: Path) -> Path:
     """A calibration that the cell's controller has."""
     calibration = calibration_for(cell_file)
-    assert main(["apply", str(cell_file), str(calibration), "--yes"]) == ExitCode.OK
-    assert main(["history", str(cell_file), "--verify"]) == ExitCode.OK
+    assert run_verb("apply", cell_file, calibration, "--yes") == ExitCode.OK
+    assert run_verb("history", cell_file, "--verify") == ExitCode.OK
     return calibration
 
 
@@ -38,12 +39,10 @@ def test_an_audit_of_any_length_is_not_read_into_memory(
 ) -> None:
     with place_of(cell_file).audit.open("ab") as stream:
         stream.truncate(1 << 40)  # no block of it is on the disk
-    assert main(["history", str(cell_file), "--verify"]) == ExitCode.DATA_UNFIT
+    assert run_verb("history", cell_file, "--verify") == ExitCode.DATA_UNFIT
     assert "more than 1073741824 bytes" in capsys.readouterr().err
     calibration_text = str(calibration_for(cell_file, 1.01))
-    assert (
-        main(["apply", str(cell_file), calibration_text, "--yes"]) == ExitCode.CALIBRATION_REFUSED
-    )
+    assert run_verb("apply", cell_file, calibration_text, "--yes") == ExitCode.CALIBRATION_REFUSED
     assert "more than 1073741824 bytes" in capsys.readouterr().err
 
 
@@ -87,10 +86,10 @@ def test_a_write_that_was_killed_is_entered_before_the_one_that_follows(
     cell_file: Path, applied: Path
 ) -> None:
     kill_before_the_end(cell_file)
-    assert main(["history", str(cell_file), "--add", str(applied)]) == ExitCode.OK
+    assert run_verb("history", cell_file, "--add", applied) == ExitCode.OK
     later = calibration_for(cell_file, 1.02)
-    assert main(["apply", str(cell_file), str(later), "--yes"]) == ExitCode.OK
-    assert main(["history", str(cell_file), "--verify"]) == ExitCode.OK
+    assert run_verb("apply", cell_file, later, "--yes") == ExitCode.OK
+    assert run_verb("history", cell_file, "--verify") == ExitCode.OK
     history = history_of(cell_file)
     first, second = history.entries
     digests = [event.digest for event in history.events]

@@ -35,6 +35,7 @@ from daq.ledger.ledger import (
 )
 from ident.calibration import Calibration
 from tests.daq.calibrations import AXES, calibration_for, demo_calibration
+from tests.daq.command_line import run_verb
 from tests.daq.histories import (
     BEGIN,
     calibration_of,
@@ -87,7 +88,8 @@ def test_the_same_file_is_entered_once(ledger: Ledger) -> None:
     assert len(read(ledger.audit)) == 1
     # Two processes at once may both find that it is not there.
     (entry,) = read(ledger.audit)
-    later = {**entry.details, "entered": iso(BEGIN + timedelta(hours=1))}
+    entered = iso(BEGIN + timedelta(hours=1))
+    later = {**entry.details, "entered": entered}
     append(ledger.audit, entry.action, at=BEGIN, who="kim", subject=entry.subject, details=later)
     (found,) = read_history(ledger).entries
     assert found.entered == BEGIN
@@ -101,9 +103,10 @@ def test_entries_are_in_the_order_in_which_they_were_fitted(ledger: Ledger) -> N
     for day, week in enumerate((3, 0, 2, 1)):
         enter_later(calibration_of(week), day)
     # Of another time zone, and at another spelling of it.
+    created = (BEGIN + timedelta(hours=1)).astimezone(timezone(-timedelta(hours=9))).isoformat()
     late = replace(
         calibration_of(0),
-        created=(BEGIN + timedelta(hours=1)).astimezone(timezone(-timedelta(hours=9))).isoformat(),
+        created=created,
     )
     enter_later(late, 4)
     entries = read_history(ledger).entries
@@ -128,12 +131,13 @@ def test_a_calibration_without_a_time_has_that_of_its_entry(ledger: Ledger) -> N
 def test_what_cannot_be_compared_is_refused(ledger: Ledger, different: str) -> None:
     known = calibration_of(0)
     changed_calibration = replace(calibration_of(1), cell="another")
+    gains = (*known.gains[:5], replace(known.gains[5], unit="Nm/A_peak"))
+    axes = replace(calibration_of(1), gains=known.gains[:5])
+    unit = replace(calibration_of(1), gains=gains)
     other = {
         "cell": changed_calibration,
-        "axes": replace(calibration_of(1), gains=known.gains[:5]),
-        "unit": replace(
-            calibration_of(1), gains=(*known.gains[:5], replace(known.gains[5], unit="Nm/A_peak"))
-        ),
+        "axes": axes,
+        "unit": unit,
     }[different]
     enter(ledger, known)
     with pytest.raises(DataError) as refused:
@@ -176,7 +180,8 @@ def test_what_is_applied_and_rolled_back_is_reported(ledger: Ledger) -> None:
         WriteAction.ROLLED_BACK,
         WriteAction.ROLLED_BACK,
     ]
-    assert all(entry.applied for entry in history.entries)
+    for entry in history.entries:
+        assert entry.applied
 
 
 def test_what_a_person_entered_between_two_writes_is_no_calibration(ledger: Ledger) -> None:
@@ -342,10 +347,11 @@ def test_a_write_of_a_killed_process_is_entered_by_the_next_one(cell_file: Path)
     assert controller is not None
     controller.write_bytes(b"new")
     subject = str(controller.resolve())
+    calibration = {"sha256": digest, "cell": "demo"}
     details = {
         "sha256_before": "0" * 64,
         "sha256_after": "11507a0e2f5e69d5dfa40a62a1bd7b6ee57e6bcd85c67c9b8431b36fff21c437",
-        "calibration": {"sha256": digest, "cell": "demo"},
+        "calibration": calibration,
     }
     append(
         ledger.audit,
@@ -356,14 +362,14 @@ def test_a_write_of_a_killed_process_is_entered_by_the_next_one(cell_file: Path)
         details=details,
     )
     assert history_of(cell_file).events == ()  # a history does not depend on what a file is today
-    assert main(["history", str(cell_file), "--verify"]) == 4
+    assert run_verb("history", cell_file, "--verify") == 4
     for _ in range(2):
         enter(ledger, calibration_of(0))
         events = history_of(cell_file).events
         assert [(event.who, event.at) for event in events] == [("anna", BEGIN)]
         actions = [entry.action for entry in read(ledger.audit)]
         assert actions.count(AuditAction.WRITE_FOUND) == 1
-    assert main(["history", str(cell_file), "--verify"]) == 0
+    assert run_verb("history", cell_file, "--verify") == 0
     controller.write_bytes(b"edited")
     assert len(history_of(cell_file).events) == 1
     # Its writer was not killed after all, only late.
@@ -399,7 +405,7 @@ def test_the_next_write_proves_the_killed_one_before_it(cell_file: Path) -> None
     assert digests == [first, second]
     write(ledger, subject, "1" * 64, before="2" * 64)
     assert history_of(cell_file).in_force(subject) == first
-    assert main(["history", str(cell_file), "--verify"]) == 0
+    assert run_verb("history", cell_file, "--verify") == 0
 
 
 def test_another_cell_of_the_same_audit_has_its_own(cell_file: Path) -> None:
@@ -439,7 +445,8 @@ def test_a_calibration_that_cannot_be_read_is_a_finding(
         {"figures": {"gains": 1}},
     ]
     for number, more in enumerate(unreadable):
-        details = {"cell": "demo", "sha256": f"{number}" * 64, "entered": iso(BEGIN), **more}
+        sha256 = f"{number}" * 64
+        details = {"cell": "demo", "sha256": sha256, "entered": iso(BEGIN), **more}
         append(
             ledger.audit,
             AuditAction.CALIBRATION_ENTERED,
@@ -449,7 +456,7 @@ def test_a_calibration_that_cannot_be_read_is_a_finding(
             details=details,
         )
     assert len(history_of(cell_file).entries) == 1
-    assert main(["history", str(cell_file), "--verify"]) == 4
+    assert run_verb("history", cell_file, "--verify") == 4
     error_output = capsys.readouterr().err
     said = " ".join(error_output.split())
     assert "calibration 000000000000… of entry 2: its document is" in said
@@ -494,19 +501,17 @@ def test_a_log_without_its_note_is_said_to_be_one(
     cell_file: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     calibration_text = str(calibration_for(cell_file))
-    assert main(["history", str(cell_file), "--add", calibration_text]) == ExitCode.OK
+    assert run_verb("history", cell_file, "--add", calibration_text) == ExitCode.OK
     note = head_file(ledger_of(cell_file).audit)
     for spoil in (note.unlink, lambda: note.write_text("no digest\n")):
         spoil()
-        assert main(["history", str(cell_file), "--verify"]) == ExitCode.OK
+        assert run_verb("history", cell_file, "--verify") == ExitCode.OK
         printed = capsys.readouterr().out
         assert ("a missing end of the audit log would not be noticed") in " ".join(printed.split())
-    assert (
-        main(["history", str(cell_file), "--add", str(calibration_for(cell_file, 1.01))])
-        == ExitCode.OK
-    )
+    code = run_verb("history", cell_file, "--add", calibration_for(cell_file, 1.01))
+    assert code == ExitCode.OK
     capsys.readouterr()
-    assert main(["history", str(cell_file), "--verify"]) == ExitCode.OK
+    assert run_verb("history", cell_file, "--verify") == ExitCode.OK
     assert "cannot be seen" not in capsys.readouterr().out
 
 
@@ -525,7 +530,7 @@ def test_a_path_that_is_not_utf_8_is_in_the_history(
     targets = [event.target for event in history.events]
     assert targets == [other, subject]
     assert history.in_force(other) == first
-    assert main(["history", str(cell_file), "--verify"]) == 0
+    assert run_verb("history", cell_file, "--verify") == 0
     for arguments in (["--axis", "J4"], ["--json"], ["--csv", str(cell_file.with_suffix(".csv"))]):
-        assert main(["history", str(cell_file), *arguments]) == 0
+        assert run_verb("history", cell_file, *arguments) == 0
     assert "ctl\udcff" not in capsys.readouterr().out

@@ -33,6 +33,7 @@ from daq.ledger.fold import WriteAction
 from daq.ledger.ledger import Ledger, migrate, read_history
 from daq.ledger.migration import VERSION, read_stored
 from tests.daq.calibrations import calibration_for
+from tests.daq.command_line import run_verb
 from tests.daq.histories import BEGIN, history_of, ledger_of
 
 FILES = Path(__file__).parents[2] / "data" / "two_ledgers"
@@ -66,7 +67,7 @@ def change(cell_file: Path, statements: str) -> None:
 def shown(cell_file: Path, capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
     """What `history --json` prints."""
     capsys.readouterr()
-    assert main(["history", str(cell_file), "--json"]) == ExitCode.OK
+    assert run_verb("history", cell_file, "--json") == ExitCode.OK
     printed = capsys.readouterr().out
     found: dict[str, Any] = json.loads(printed)
     return found
@@ -93,7 +94,7 @@ def test_the_first_command_migrates_it_and_shows_what_the_version_before_showed(
     assert aside.read_bytes() == content
     entries = read(audit_of(cell_file))
     assert len(entries) == 13  # the figures of three calibrations
-    assert main(["history", str(cell_file), "--verify"]) == ExitCode.OK
+    assert run_verb("history", cell_file, "--verify") == ExitCode.OK
     assert shown(cell_file, capsys) == expected
     assert read(audit_of(cell_file)) == entries
     assert writers_of(cell_file) == WRITERS
@@ -172,7 +173,7 @@ def test_a_history_of_a_version_whose_audit_has_no_calibrations(
     calibrations = read_stored(stored_of(cell_file)).calibrations
     digests = {one.digest for one in calibrations}
     assert len(digests) == 3
-    assert main(["history", str(cell_file), "--verify"]) == ExitCode.OK
+    assert run_verb("history", cell_file, "--verify") == ExitCode.OK
     entries = history_of(cell_file).entries
     assert {one.digest for one in entries} == digests
     assert writers_of(cell_file) == ["Ada"]
@@ -298,14 +299,14 @@ def test_a_sound_file_that_cannot_be_read_now_is_never_put_aside(
     before = read(audit_of(cell_file))
     with closing(sqlite3.connect(stored_of(cell_file), isolation_level=None)) as other:
         other.execute("BEGIN EXCLUSIVE")
-        assert main(["history", str(cell_file), "--migrate"]) == ExitCode.DATA_UNFIT
+        assert run_verb("history", cell_file, "--migrate") == ExitCode.DATA_UNFIT
     error_output = capsys.readouterr().err
     said = " ".join(error_output.split())
     assert "SQLITE_BUSY" in said
     assert "try again" in said
     assert asides_of(cell_file) == []
     assert read(audit_of(cell_file)) == before
-    assert main(["history", str(cell_file), "--migrate", "--verify"]) == ExitCode.OK
+    assert run_verb("history", cell_file, "--migrate", "--verify") == ExitCode.OK
     assert writers_of(cell_file) == WRITERS
 
 
@@ -345,7 +346,7 @@ def _execute(path: Path, statements: str) -> None:
 
 def test_an_empty_file_is_an_empty_history(cell_file: Path) -> None:
     stored_of(cell_file).write_bytes(b"")
-    assert main(["history", str(cell_file), "--verify"]) == ExitCode.OK
+    assert run_verb("history", cell_file, "--verify") == ExitCode.OK
     assert writers_of(cell_file) == WRITERS
 
 
@@ -379,7 +380,7 @@ def test_an_unfinished_transaction_of_a_killed_writer_is_undone_first(cell_file:
         os.kill(os.getpid(), signal.SIGKILL)
     os.waitpid(child, 0)
     assert stored_of(cell_file).with_name("demo.history.sqlite-journal").stat().st_size
-    assert main(["history", str(cell_file), "--verify"]) == ExitCode.OK
+    assert run_verb("history", cell_file, "--verify") == ExitCode.OK
     assert writers_of(cell_file) == WRITERS
     (aside,) = asides_of(cell_file)
     content = (FILES / "demo.history.sqlite").read_bytes()
@@ -392,11 +393,11 @@ def test_one_that_is_locked_for_long_is_reported(
     monkeypatch.setattr("daq.ledger.migration.BUSY_S", 0.01)
     with closing(sqlite3.connect(stored_of(cell_file), isolation_level=None)) as other:
         other.execute("BEGIN EXCLUSIVE")
-        assert main(["history", str(cell_file)]) == ExitCode.DATA_UNFIT
+        assert run_verb("history", cell_file) == ExitCode.DATA_UNFIT
         error_output = capsys.readouterr().err
         assert "who has it open" in " ".join(error_output.split())
         other.execute("ROLLBACK")
-    assert main(["history", str(cell_file)]) == ExitCode.OK
+    assert run_verb("history", cell_file) == ExitCode.OK
 
 
 @pytest.mark.parametrize("lost", ["changed", "deleted", "cut off"])
@@ -441,7 +442,8 @@ def test_a_cell_whose_gains_are_applied_again_knows_the_old_write(
 def test_another_audit_than_the_cells_has_no_history_of_sqlite(
     cell_file: Path, tmp_path: Path
 ) -> None:
-    ledger = Ledger.of(ledger_of(cell_file).cell, tmp_path / "another.jsonl")
+    cell = ledger_of(cell_file).cell
+    ledger = Ledger.of(cell, tmp_path / "another.jsonl")
     assert ledger is not None
     assert not ledger.outdated
     assert read_history(ledger).entries == ()

@@ -57,7 +57,8 @@ def test_a_note_of_which_the_disk_takes_a_part_accuses_no_sound_log(
     monkeypatch.setattr(os, "pwrite", _FullDisk(room).pwrite)
     _append(audit)
     noted = noted_heads(audit)
-    assert noted == ((first.sha256,) if room == 0 else ())
+    expected = (first.sha256,) if room == 0 else ()
+    assert noted == expected
     assert verify(audit, noted).holds
     monkeypatch.undo()
     last = _append(audit)

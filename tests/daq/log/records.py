@@ -45,7 +45,8 @@ def finished_file(path: Path, records: list[bytes]) -> Path:
     footer = raw_record(Opcode.FOOTER, packed)[:9].replace(b"\x10", b"\x14", 1) + struct.pack(
         "<QQ", 0, 0
     )
-    path.write_bytes(data + footer + struct.pack("<I", zlib.crc32(footer)) + MAGIC)
+    content = data + footer + struct.pack("<I", zlib.crc32(footer)) + MAGIC
+    path.write_bytes(content)
     return path
 
 
@@ -96,9 +97,10 @@ TOPICS = definitions(SAMPLES_TOPIC, SAMPLES_SCHEMA, 1) + definitions(EVENTS_TOPI
 def sample_records(cycle: Sequence[int], time_ns: Sequence[int], axes: int = 6) -> bytes:
     """Messages of samples at rest, shape (k,) each; one chunk holds some of them."""
     made = np.zeros(len(cycle), dtype=sample_dtype(axes))
+    length = made.itemsize - 9
     heads = {
         "opcode": Opcode.MESSAGE,
-        "length": made.itemsize - 9,
+        "length": length,
         "channel": 1,
         "encapsulation": 0x100,
     }

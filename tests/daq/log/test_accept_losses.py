@@ -73,7 +73,8 @@ def test_the_recorder_counts_them_by_these_names() -> None:
     assert reason
     assert reports_only_losses(reason)
     expected = {loss.value for loss in Loss if loss.masked}
-    assert {part.split(" ", 1)[1] for part in reason.split(", ")} == expected
+    words = reason.split(", ")
+    assert {part.split(" ", 1)[1] for part in words} == expected
     losses = {loss.value for loss in Loss if loss.masked}
     assert losses == set(MASKED)
     statistics = StreamStatistics(missing=1, skipped_periods=1)

@@ -38,6 +38,7 @@ from daq.log.mcap_bag import joint_state_from_cdr
 from daq.log.message import DEFINITIONS, JOINTS_SCHEMA
 from daq.log.reader import read_log
 from daq.log.table import Table
+from tests.daq.command_line import run_verb
 from tests.daq.logs import damaged
 
 JOINTS = tuple(f"J{number}" for number in range(1, 7))
@@ -57,8 +58,9 @@ def message(row: int, joints: Sequence[int] = range(6), **changes: Any) -> dict[
     seconds, nanoseconds = divmod(START_NS + row * STEP_NS, 10**9)
     positions = [float(POSITION[row, joint]) for joint in joints]
     efforts = [float(EFFORT[row, joint]) for joint in joints]
+    header = {"stamp": {"sec": seconds, "nanosec": nanoseconds}, "frame_id": "base"}
     return {
-        "header": {"stamp": {"sec": seconds, "nanosec": nanoseconds}, "frame_id": "base"},
+        "header": header,
         "name": [JOINTS[joint] for joint in joints],
         "position": positions,
         "velocity": [],
@@ -168,7 +170,8 @@ def test_several_publishers_make_one_row_a_stamp(tmp_path: Path) -> None:
     cut_path = tmp_path / "cut.mcap"
     cut = read(write_bag(cut_path, parts[1:-1]))
     stacked_position = np.hstack((POSITION, EFFORT))
-    np.testing.assert_array_equal(cut.values, stacked_position[1:-1])
+    expected = stacked_position[1:-1]
+    np.testing.assert_array_equal(cut.values, expected)
     assert cut.remarks == ("left out, as joints are missing at the ends of the bag: 2 stamps",)
     messages = [*parts[:32], *parts[33:]]
     gap_path = tmp_path / "gap.mcap"
@@ -188,10 +191,11 @@ def _unmeasured(row: int) -> dict[str, Any]:
 
 
 def test_messages_before_the_first_reading_are_left_out(tmp_path: Path) -> None:
-    parts = [
-        ("/joint_states", _unmeasured(row) if row in {0, 1, 2, ROWS - 1} else message(row))
-        for row in range(ROWS)
-    ]
+    parts = []
+    for row in range(ROWS):
+        parts.append(
+            ("/joint_states", _unmeasured(row) if row in {0, 1, 2, ROWS - 1} else message(row))
+        )
     path = tmp_path / "run.mcap"
     table = read(write_bag(path, parts))
     stacked_position = np.hstack((POSITION, EFFORT))
@@ -347,7 +351,8 @@ def test_positions_and_efforts_of_different_messages_are_joined_by_their_stamps(
     bag = write_bag(path, _apart(topic))
     assert_whole(read(bag, **sections))
     # Beginning and end are those of the shorter one.
-    messages = _apart(topic, effort_rows=range(10, ROWS - 20))
+    effort_rows = range(10, ROWS - 20)
+    messages = _apart(topic, effort_rows=effort_rows)
     run_path = tmp_path / "run.mcap"
     bag = write_bag(run_path, messages)
     table = read(bag, **sections)
@@ -407,10 +412,11 @@ def test_positions_and_efforts_in_separate_messages_have_a_way(
 
 def _alike(every: int, later_ns: int) -> list[tuple[str, dict[str, Any]]]:
     """A second node with the same joints, frame and fields: its stamps alone are others."""
-    stamped = [(START_NS + row * STEP_NS, message(row)) for row in range(ROWS)]
-    stamped += [
-        (START_NS + row * STEP_NS + later_ns, message(row)) for row in range(0, ROWS, every)
-    ]
+    stamped = []
+    for row in range(ROWS):
+        stamped.append((START_NS + row * STEP_NS, message(row)))
+    rows = range(0, ROWS, every)
+    stamped += [(START_NS + row * STEP_NS + later_ns, message(row)) for row in rows]
     stamped.sort(key=lambda one: one[0])
     parts = []
     for stamp_ns, content in stamped:
@@ -430,7 +436,8 @@ def test_two_publishers_with_nothing_but_other_stamps_are_refused(
     with pytest.raises(TableUnfit, match="stamps of two publishers") as caught:
         read(bag)
     assert f"{ROWS} messages each 0.004 s" in caught.value.found
-    assert f"{ROWS // every} messages each {0.004 * every:g} s" in caught.value.found
+    expected = f"{ROWS // every} messages each {0.004 * every:g} s"
+    assert expected in caught.value.found
     assert "`frame_id`" in caught.value.remedy
     assert "`rhythm: 1`" in caught.value.remedy
     first = read(bag, rhythm=1)
@@ -517,7 +524,9 @@ def test_publishers_with_a_channel_each_are_named_and_chosen(
 
 def test_channels_after_each_other_are_one_publisher(tmp_path: Path) -> None:
     """A recorder that is set up anew in one file gives the topic another channel."""
-    parts = [(int(row >= ROWS // 2), message(row)) for row in range(ROWS)]
+    parts = []
+    for row in range(ROWS):
+        parts.append((int(row >= ROWS // 2), message(row)))
     run_path = tmp_path / "run.mcap"
     path = _write_channels(run_path, parts)
     assert_whole(read(path))
@@ -543,9 +552,9 @@ def test_the_same_message_twice_is_two_rows(tmp_path: Path) -> None:
 
 
 def test_joints_that_are_never_stamped_together_are_refused(tmp_path: Path) -> None:
-    parts = [
-        ("/joint_states", message(row, (0, 1, 2) if row % 2 else (3, 4, 5))) for row in range(ROWS)
-    ]
+    parts = []
+    for row in range(ROWS):
+        parts.append(("/joint_states", message(row, (0, 1, 2) if row % 2 else (3, 4, 5))))
     path = tmp_path / "run.mcap"
     with pytest.raises(
         TableUnfit,
@@ -610,7 +619,8 @@ def test_a_folder_is_one_bag_of_several_files(tmp_path: Path) -> None:
     folder.mkdir()
     for number in range(11):
         path = folder / f"bag_{number}.mcap"
-        write_bag(path, whole()[number * 20 : (number + 1) * 20])
+        messages = whole()[number * 20 : (number + 1) * 20]
+        write_bag(path, messages)
     assert_whole(read(folder))
 
 
@@ -619,7 +629,8 @@ def _in_parts(folder: Path, listed: str) -> Path:
     folder.mkdir()
     for number in range(3):
         path = folder / f"bag_{number}.mcap"
-        write_bag(path, whole()[number * 80 : (number + 1) * 80])
+        messages = whole()[number * 80 : (number + 1) * 80]
+        write_bag(path, messages)
     metadata = (
         f"rosbag2_bagfile_information:\n  version: 9\n  relative_file_paths:\n{listed}  "
         "topics: []\n"
@@ -651,7 +662,9 @@ def test_a_bag_that_lacks_a_part_is_refused(listed: str, tmp_path: Path) -> None
 
 
 def test_a_topic_is_chosen(tmp_path: Path) -> None:
-    others = [("/desired", {**one, "position": [9.0] * 6}) for _, one in whole()]
+    others = []
+    for _, one in whole():
+        others.append(("/desired", {**one, "position": [9.0] * 6}))
     messages = [*others, *whole()]
     path = tmp_path / "run.mcap"
     bag = write_bag(path, messages)
@@ -710,11 +723,14 @@ def test_what_a_bag_lacks_is_named(
 
 def _document(checkout: Path) -> dict[str, object]:
     """An import description of the bag `run.mcap`."""
+    position = {"file": "run.mcap", "columns": ["position"], "unit": "rad", "side": "joint"}
+    current = {"file": "run.mcap", "columns": ["effort"], "unit": "A"}
+    cell = str(checkout / "configs/cells/demo.yaml")
     return {
         "name": "run",
-        "cell": str(checkout / "configs/cells/demo.yaml"),
-        "position": {"file": "run.mcap", "columns": ["position"], "unit": "rad", "side": "joint"},
-        "current": {"file": "run.mcap", "columns": ["effort"], "unit": "A"},
+        "cell": cell,
+        "position": position,
+        "current": current,
         "time": {"file": "run.mcap", "column": STAMP, "unit": "ns"},
     }
 
@@ -726,7 +742,7 @@ def test_a_bag_is_imported_with_its_joints_as_axes(checkout: Path, tmp_path: Pat
     document = _document(checkout)
     description.write_text(json.dumps(document))
     out = tmp_path / "log.mcap"
-    assert main(["import", str(description), "--data", str(tmp_path), "--out", str(out)]) == 0
+    assert run_verb("import", description, "--data", tmp_path, "--out", out) == 0
     run, _ = load_run(out)
     assert run.rate_hz == pytest.approx(250.0)
     np.testing.assert_allclose(run.position_rad, POSITION, atol=1e-8)
@@ -740,17 +756,13 @@ def test_a_bag_is_imported_with_its_joints_as_axes(checkout: Path, tmp_path: Pat
     document["current"] = {"file": "run.mcap", "columns": list(JOINTS), "unit": "A"}
     description.write_text(json.dumps(document))
     again = tmp_path / "again.mcap"
-    assert main(["import", str(description), "--data", str(tmp_path), "--out", str(again)]) == 0
+    assert run_verb("import", description, "--data", tmp_path, "--out", again) == 0
     assert again.read_bytes() == out.read_bytes()
     time = {"file": "run.mcap", "column": "stamp", "unit": "s"}
     text = json.dumps({**document, "time": time})
     description.write_text(text)
-    assert (
-        main(
-            ["import", str(description), "--data", str(tmp_path), "--out", str(tmp_path / "x.mcap")]
-        )
-        == 4
-    )
+    code = run_verb("import", description, "--data", tmp_path, "--out", tmp_path / "x.mcap")
+    assert code == 4
 
 
 @pytest.mark.parametrize(
@@ -761,7 +773,8 @@ def test_a_bag_has_no_temperature(checkout: Path, tmp_path: Path, columns: list[
     write_bag(path, whole()[:1])
     description = tmp_path / "run.yaml"
     out = tmp_path / "log.mcap"
-    document = {**_document(checkout), "temperature": {"file": "run.mcap", "columns": columns}}
+    temperature = {"file": "run.mcap", "columns": columns}
+    document = {**_document(checkout), "temperature": temperature}
     description.write_text(json.dumps(document))
     with pytest.raises(
         TableUnfit, match="found `temperature` from a ROS 2 bag; expected a file with temperatures"
@@ -858,7 +871,8 @@ def test_a_bag_that_ends_before_its_first_message_is_not_salvaged(
 def test_a_bag_of_a_killed_recorder_is_called_unfinished(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     bag = write_bag(path, whole(), chunk_size=4000)
-    bag.write_bytes(bag.read_bytes()[:-2000])
+    content = bag.read_bytes()[:-2000]
+    bag.write_bytes(content)
     with pytest.raises(LogTruncated, match=r"expected a finished bag; .*mcap recover"):
         read(bag)
     with pytest.raises(LogForeign, match="joint states of J1"):
@@ -891,7 +905,8 @@ def test_a_damaged_bag_is_refused_or_the_same(
 def bag_bytes(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     """A bag of some chunks."""
     path = tmp_path_factory.mktemp("bag") / "run.mcap"
-    return write_bag(path, whole()[:60], chunk_size=4000).read_bytes()
+    messages = whole()[:60]
+    return write_bag(path, messages, chunk_size=4000).read_bytes()
 
 
 @settings(deadline=None, max_examples=200, derandomize=True)

@@ -188,10 +188,13 @@ def test_a_database_that_its_recorder_has_not_finished_is_refused(
     rest.touch()
     assert len(read(path).values) == 60
     rest.write_bytes(b"rows")
+    pattern = (
+        rf"found bag\.db3{suffix}, .*; expected a finished bag; "
+        r".*quick_check"
+    )
     with pytest.raises(
         LogTruncated,
-        match=rf"found bag\.db3{suffix}, .*; expected a finished bag; "
-        r".*quick_check",
+        match=pattern,
     ):
         read(path)
 
@@ -216,7 +219,8 @@ def test_a_damaged_database_is_read_or_refused(
 
 def test_a_bomb_is_not_unpacked(tmp_path: Path) -> None:
     path = tmp_path / "bag.mcap.zstd"
-    path.write_bytes(zstandard.compress(bytes(2**28)))
+    content = zstandard.compress(bytes(2**28))
+    path.write_bytes(content)
     with pytest.raises(
         LogCorrupt, match="unfolds to 200 times its size; expected a recording, packed by zstd"
     ):
@@ -234,7 +238,8 @@ def test_a_packed_file_that_is_damaged_is_named(
     change: Callable[[bytes], bytes], database: Path, tmp_path: Path
 ) -> None:
     path = tmp_path / "bag.db3.zstd"
-    path.write_bytes(change(zstandard.compress(database.read_bytes())))
+    content = change(zstandard.compress(database.read_bytes()))
+    path.write_bytes(content)
     with pytest.raises(DataError) as caught:
         read(path)
     assert str(caught.value).startswith(str(path))
@@ -250,12 +255,13 @@ def test_no_room_for_what_a_file_unfolds_to_is_an_error(
     bag_folder = tmp_path / "bag"
     folder = record(bag_folder, StoragePlugin.MCAP, CompressionMode.FILE)
     description = tmp_path / "run.yaml"
-    description.write_text(
+    text = (
         f"name: run\ncell: {checkout / 'configs/cells/demo.yaml'}\n"
         "position: {file: bag, columns: [position], unit: rad, side: joint}\n"
         "current: {file: bag, columns: [effort], unit: A}\ntime: {file: bag, column: header.stamp, "
         "unit: ns}\n"
     )
+    description.write_text(text)
     words = [
         "import",
         str(description),

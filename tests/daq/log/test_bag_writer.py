@@ -12,7 +12,6 @@ import pytest
 import yaml
 from rosbags.highlevel import AnyReader
 
-from daq.cli.app import main
 from daq.config.cell_file import load_cell
 from daq.errors import ConfigurationInconsistent, ExitCode, UsageError
 from daq.log.bag_writer import export_bag, joint_effort, mean_velocity
@@ -21,6 +20,7 @@ from daq.log.writer import LogWriter
 from drivers.messages import CellEvent, EventKind, Quantity, SlowReading
 from ident.calibration import Calibration
 from tests.daq.calibrations import demo_calibration
+from tests.daq.command_line import run_verb
 from tests.daq.logs import START_NS, demo_content, joints, samples
 
 AXES = 6
@@ -93,7 +93,8 @@ def test_rosbags_reads_a_bag_with_the_numbers_of_the_fit(
     assert sec * 10**9 + nanosec == START_NS
     assert "<robot" in found["/robot_description"][0].data
     cell_torque = found["/cell/torque"][0].value
-    assert (found["/cell/torque"][0].axis, cell_torque) == (1, 0.25)
+    assert found["/cell/torque"][0].axis == 1
+    assert cell_torque == 0.25
     assert found["/cell/temperature"][0].value == 31.5
     assert found["/cell/events"][0].text == "J3 (node 3): following error"
 
@@ -123,16 +124,16 @@ def test_the_description_is_kept_for_late_subscribers_and_the_rest_is_not(
     text = (tmp_path / "bag/metadata.yaml").read_text()
     said = yaml.safe_load(text)["rosbag2_bagfile_information"]
     topics = [topic["topic_metadata"] for topic in said["topics_with_message_count"]]
-    durability = {
-        topic["name"]: yaml.safe_load(topic["offered_qos_profiles"])[0]["durability"]
-        for topic in topics
-    }
+    durability = {}
+    for topic in topics:
+        durability[topic["name"]] = yaml.safe_load(topic["offered_qos_profiles"])[0]["durability"]
     assert durability.pop("/robot_description") == 1
     assert set(durability.values()) == {2}
     assert said["relative_file_paths"] == ["bag_0.mcap"]
     path = tmp_path / "bag"
     joint_states = _read(path)["/joint_states"]
-    assert all(len(state.effort) == 0 for state in joint_states)
+    for state in joint_states:
+        assert len(state.effort) == 0
 
 
 def test_a_velocity_is_the_mean_over_twenty_milliseconds_and_less_at_the_ends() -> None:
@@ -141,7 +142,8 @@ def test_a_velocity_is_the_mean_over_twenty_milliseconds_and_less_at_the_ends() 
     position = np.stack((time_s**2, 3.0 * time_s), axis=1)
     found = mean_velocity(position, time_ns)
     expected = 2.0 * time_s[10:-10]
-    np.testing.assert_allclose(found[10:-10, 0], expected, rtol=1e-6)
+    actual = found[10:-10, 0]
+    np.testing.assert_allclose(actual, expected, rtol=1e-6)
     np.testing.assert_allclose(found[:, 1], 3.0, rtol=1e-6)
     assert found[0, 0] == pytest.approx(0.01, rel=1e-6)  # of the first 10 ms
     # At a slow rate the neighbours are farther away than that.
@@ -157,8 +159,10 @@ def test_a_coupled_motor_acts_on_both_joints(checkout: Path) -> None:
     current = np.array([[1.0, -1.0, 0.0, 0.0, 0.0], [1.0, 1.0, 0.0, 0.0, 0.0]])
     effort = joint_effort(cell, current, gains)
     absolute_effort = abs(effort[0, 0])
-    assert absolute_effort == pytest.approx(0.0 if effort[0, 1] else 200.0)
-    sorted_absolute_efforts = sorted(np.abs(effort[:, :2]).ravel().tolist())
+    expected = 0.0 if effort[0, 1] else 200.0
+    assert absolute_effort == pytest.approx(expected)
+    orders = np.abs(effort[:, :2]).ravel().tolist()
+    sorted_absolute_efforts = sorted(orders)
     assert sorted_absolute_efforts == pytest.approx([0.0, 0.0, 200.0, 200.0])
 
 
@@ -166,16 +170,18 @@ def test_the_verb_says_what_it_wrote_and_refuses_what_is_there(
     log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "bag"
-    assert main(["export", "bag", str(log), "--out", str(out), "--json"]) == ExitCode.OK
+    assert run_verb("export", "bag", log, "--out", out, "--json") == ExitCode.OK
     said = json.loads(capsys.readouterr().out)
     assert said["messages"]["/joint_states"] == ROWS
     assert said["effort"] is False
     with pytest.raises(UsageError, match="file or folder of that name"):
         export_bag(log, out)
+    gains = _calibration().gains[::-1]
     for other in (
         replace(_calibration(), cell="other"),
-        replace(_calibration(), gains=_calibration().gains[::-1]),
+        replace(_calibration(), gains=gains),
     ):
         with pytest.raises(ConfigurationInconsistent, match="as in the calibration"):
             export_bag(log, tmp_path / "other", other)
-    assert [path.name for path in tmp_path.iterdir()] == ["bag"]
+    names = [path.name for path in tmp_path.iterdir()]
+    assert names == ["bag"]

@@ -60,9 +60,8 @@ def record(checkout: Path, tmp_path: Path) -> Recorder:
 def test_joint_positions_are_those_of_the_drive_train(counts: list[int]) -> None:
     """q_motor = R q_joint (eq. 24), so R q must give the counts back."""
     joint_rad = DEMO_SCALING.joint_position(np.array(counts))
-    np.testing.assert_allclose(
-        CELL.ratio @ joint_rad / (2 * pi) * 65536, counts, rtol=1e-9, atol=1e-3
-    )
+    actual = CELL.ratio @ joint_rad / (2 * pi) * 65536
+    np.testing.assert_allclose(actual, counts, rtol=1e-9, atol=1e-3)
 
 
 def test_motor_six_also_turns_with_joint_five() -> None:
@@ -87,16 +86,16 @@ def test_a_run_comes_from_the_log_alone(record: Recorder) -> None:
     path = record(samples(rows), events=events, loaded=True)
     run, cell = load_run(path)
     # A name is as good as a path
-    assert np.array_equal(load_run(str(path))[0].position_rad, run.position_rad)
+    position_rad = load_run(str(path))[0].position_rad
+    assert np.array_equal(position_rad, run.position_rad)
     assert cell.digest == CELL.digest
     assert run.payload == DISC
     assert run.rate_hz == pytest.approx(1000.0)
     assert run.time_s[0] == 0.0
     expected = [-6.0] * 6
     np.testing.assert_allclose(run.current_a[3], expected)
-    np.testing.assert_allclose(
-        run.position_rad[1, :4], 1000 * 2 * pi / 65536 / np.array([32, 32, 45, -48])
-    )
+    actual = run.position_rad[1, :4]
+    np.testing.assert_allclose(actual, 1000 * 2 * pi / 65536 / np.array([32, 32, 45, -48]))
     assert run.move is not None
     assert run.move.tolist() == [4] * 60 + [5] * 40
     assert run.valid is not None
@@ -107,7 +106,8 @@ def test_a_run_comes_from_the_log_alone(record: Recorder) -> None:
 def test_the_channels_of_a_log_are_judged_once(
     record: Recorder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    counts = np.round(20_000.0 * np.sin(np.arange(2_500) / 80.0)).astype(int)
+    phase_rad = np.arange(2_500) / 80.0
+    counts = np.round(20_000.0 * np.sin(phase_rad)).astype(int)
     counts[300] += 2_000  # a glitch
     rows = [[count] * 6 for count in counts.tolist()]
     path = record(samples(rows))
@@ -190,7 +190,10 @@ def test_a_gap_is_refused(record: Recorder) -> None:
 
 
 def test_a_clock_that_disagrees_is_refused(record: Recorder) -> None:
-    rows = [Sample(k, START_NS + k * 1_100_000, (0,) * 6, (0,) * 6, (0,) * 6) for k in range(20)]
+    rows = []
+    for k in range(20):
+        time_ns = START_NS + k * 1_100_000
+        rows.append(Sample(k, time_ns, (0,) * 6, (0,) * 6, (0,) * 6))
     with pytest.raises(ClockImplausible, match=r"909\.091 Hz; expected 1000 Hz"):
         load_run(record(rows))
 
@@ -228,7 +231,8 @@ def test_a_counter_that_ran_over_gives_the_way_that_was_gone(start: int, steps: 
     way = np.cumsum([start, *steps], dtype=np.int64)
     counter = ((way + 2**31) % 2**32 - 2**31).astype(np.int32)
     counts = np.stack((counter, np.full_like(counter, 7)), axis=1)
-    np.testing.assert_array_equal(unwrapped(counts)[:, 0], way)
+    actual = unwrapped(counts)[:, 0]
+    np.testing.assert_array_equal(actual, way)
 
 
 def test_a_wrap_in_a_log_is_no_turn_of_the_joint(record: Recorder) -> None:
@@ -236,12 +240,15 @@ def test_a_wrap_in_a_log_is_no_turn_of_the_joint(record: Recorder) -> None:
     end_rad = 2**31 / 65536 * 2 * pi / 32
     changed_axis = replace(CELL.axes[0], zero_offset_rad=-end_rad)
     axes = (changed_axis, *CELL.axes[1:])
-    counts = [2**31 - 3 + k - (2**32 if k >= 3 else 0) for k in range(6)]
+    counts = []
+    for k in range(6):
+        counts.append(2**31 - 3 + k - (2**32 if k >= 3 else 0))
     position_counts = [[count, 0, 0, 0, 0, 0] for count in counts]
     rows = [replace(row, current_raw=(0,) * 6) for row in samples(position_counts)]
     run, _ = load_run(record(rows), replace(CELL, axes=axes))
     expected = np.arange(-3, 3) * 2 * pi / 65536 / 32
-    np.testing.assert_allclose(run.position_rad[:, 0], expected, atol=1e-9)
+    actual = run.position_rad[:, 0]
+    np.testing.assert_allclose(actual, expected, atol=1e-9)
 
 
 def test_the_scaled_numbers_of_an_import_do_not_wrap(checkout: Path, tmp_path: Path) -> None:
@@ -250,15 +257,15 @@ def test_the_scaled_numbers_of_an_import_do_not_wrap(checkout: Path, tmp_path: P
     quantum = 0.01 / top
     axes = tuple(replace(axis, position_rad_per_count=quantum) for axis in start.readback.axes)
     readback = Readback(axes)
-    rows = [
-        Sample(k, k * 1_000_000, (sign * top,) * 6, (0,) * 6, (0,) * 6)
-        for k, sign in enumerate((1, -1))
-    ]
+    rows = []
+    for k, sign in enumerate((1, -1)):
+        rows.append(Sample(k, k * 1_000_000, (sign * top,) * 6, (0,) * 6, (0,) * 6))
     i_path = tmp_path / "i.mcap"
     path = write(i_path, replace(start, readback=readback), rows)
     run, _ = load_run(path)
     expected = [0.01 / 32, -0.01 / 32]
-    np.testing.assert_allclose(run.position_rad[:, 0], expected)
+    actual = run.position_rad[:, 0]
+    np.testing.assert_allclose(actual, expected)
 
 
 def test_an_invalid_run_is_refused(record: Recorder) -> None:
@@ -298,14 +305,16 @@ def test_the_readback_of_drives_keeps_their_answers() -> None:
 def bouncing(count: int = 3000, size: bool = True) -> list[Sample]:
     """Moves both ways, and currents of 2 Hz, of which the second is a size, or has its sign."""
     time_s = np.arange(count) / 1000.0
-    position = np.rint(20000.0 * np.sin(2.0 * pi * 0.7 * time_s)).astype(int)
+    phase_rad = 2.0 * pi * 0.7 * time_s
+    position = np.rint(20000.0 * np.sin(phase_rad)).astype(int)
     current = np.rint(400.0 * np.sin(2.0 * pi * 2.0 * time_s + 0.3)).astype(int)
     second = np.abs(current) if size else current
     rows = samples([[int(one)] * 6 for one in position])
-    return [
-        replace(row, current_raw=(int(first), int(other), *(int(first),) * 4))
-        for row, first, other in zip(rows, current, second, strict=True)
-    ]
+    found = []
+    for row, first, other in zip(rows, current, second, strict=True):
+        current_raw = (int(first), int(other), *(int(first),) * 4)
+        found.append(replace(row, current_raw=current_raw))
+    return found
 
 
 def test_a_current_without_its_sign_is_refused_by_axis(record: Recorder) -> None:

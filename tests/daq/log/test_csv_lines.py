@@ -56,7 +56,8 @@ def _read(
 ) -> Table:
     """Read position and current, and the stamps of column `t`."""
     path = folder / "run.csv"
-    path.write_text("\n".join(lines) + end, encoding="utf-8")
+    text = "\n".join(lines) + end
+    path.write_text(text, encoding="utf-8")
     if time is None:
         timed = None
     else:
@@ -67,6 +68,7 @@ def _read(
     position = PositionColumns(file="run.csv", columns=columns[:1], unit=unit, side=Side.JOINT)
     current = CurrentColumns(file="run.csv", columns=columns[1:], unit="A", factor=factor)
     table = CsvLayout(**layout)
+    rate_hz = None if time is not None else 100.0
     wanted = ImportDescription(
         name="run",
         cell="cell.yaml",
@@ -75,7 +77,7 @@ def _read(
         current=current,
         velocity=moved,
         time=timed,
-        rate_hz=None if time is not None else 100.0,
+        rate_hz=rate_hz,
         keep=keep,
     )
     return read_csv(path, wanted, columns, timed)
@@ -174,7 +176,8 @@ def test_a_unit_in_a_name_must_be_that_of_the_line_of_units(tmp_path: Path) -> N
 def test_lines_count_as_an_editor_counts_them(tmp_path: Path) -> None:
     """A form feed and a line separator of Unicode end no line."""
     lines = ["exported\x0cby\u2028hand", "t,q,i", "s,rad,A", *ROWS, "0.2,word,1.0", *ROWS[:1]]
-    with pytest.raises(TableUnfit, match=rf"run\.csv:{4 + COUNT}, column q: found 'word'"):
+    pattern = rf"run\.csv:{4 + COUNT}, column q: found 'word'"
+    with pytest.raises(TableUnfit, match=pattern):
         _read(tmp_path, lines, skip_rows=1)
     with pytest.raises(TableUnfit, match=r"run\.csv:3, column q: found unit 'deg'"):
         _read(tmp_path, [*lines[:2], "s,deg,A", *ROWS], skip_rows=1)
@@ -292,14 +295,14 @@ def test_comments_before_and_after_the_rows_are_left_out(tmp_path: Path, sign: s
 def test_a_header_may_begin_as_a_comment(tmp_path: Path, header: str, comments: list[str]) -> None:
     lines = [*comments, header, *ROWS]
     np.testing.assert_array_equal(_read(tmp_path, lines).values, READ)
-    np.testing.assert_array_equal(
-        _read(tmp_path, [*comments, header, *ROWS], time=None, columns=(2, 3)).values, READ
-    )
+    actual = _read(tmp_path, [*comments, header, *ROWS], time=None, columns=(2, 3)).values
+    np.testing.assert_array_equal(actual, READ)
 
 
 def test_a_name_with_the_sign_of_a_comment_is_still_a_name(tmp_path: Path) -> None:
     lines = ["t,#q,i", *ROWS]
-    np.testing.assert_array_equal(_read(tmp_path, lines, columns=("#q", "i")).values, READ)
+    actual = _read(tmp_path, lines, columns=("#q", "i")).values
+    np.testing.assert_array_equal(actual, READ)
     lines = ["#q,t,i", *ROWS]
     table = _read(tmp_path, lines, columns=("#q", "i"), time=None)
     expected = np.round(VALUES[:, 0], 6)
@@ -318,10 +321,13 @@ def test_a_name_with_the_sign_of_a_comment_is_still_a_name(tmp_path: Path) -> No
 )
 def test_a_line_among_the_rows_that_is_none_is_named(tmp_path: Path, line: str, place: int) -> None:
     lines = ["t,q,i", *ROWS[:place], line, *ROWS[place:]]
+    pattern = (
+        rf"run\.csv:{place + 2}: found .*a line that is no row "
+        r"of numbers"
+    )
     with pytest.raises(
         TableUnfit,
-        match=rf"run\.csv:{place + 2}: found .*a line that is no row "
-        r"of numbers",
+        match=pattern,
     ) as caught:
         _read(tmp_path, lines)
     assert "delimiter" not in caught.value.remedy
@@ -357,7 +363,8 @@ def test_line_ends_that_were_doubled_make_no_rows(tmp_path: Path) -> None:
     doubled: list[str] = []
     for row in ("t,q,i", *ROWS):
         doubled += [row, ""]
-    np.testing.assert_array_equal(_read(tmp_path, doubled, time=None).values, READ)
+    actual = _read(tmp_path, doubled, time=None).values
+    np.testing.assert_array_equal(actual, READ)
 
 
 @pytest.mark.parametrize("line", ["sep=,", '"sep=,"', "SEP=,"])
@@ -370,7 +377,8 @@ def test_another_delimiter_than_the_files_own_is_refused(tmp_path: Path) -> None
     lines = ["sep=;", "t;q;i", *(row.replace(",", ";") for row in ROWS)]
     with pytest.raises(TableUnfit, match=r"run\.csv:1: found `sep=;`.*write `delimiter: ';'`"):
         _read(tmp_path, lines)
-    np.testing.assert_array_equal(_read(tmp_path, lines, delimiter=";").values, READ)
+    actual = _read(tmp_path, lines, delimiter=";").values
+    np.testing.assert_array_equal(actual, READ)
 
 
 def test_the_minus_sign_of_typography_is_read(tmp_path: Path) -> None:
@@ -384,10 +392,12 @@ def test_a_last_line_that_was_cut_off_is_left_out_by_the_setting_that_is_named(
     tmp_path: Path,
 ) -> None:
     lines = ["t,q,i", *ROWS, "0.12,0.3"]
-    with pytest.raises(TableUnfit, match=rf"the file ends early.*`keep: \{{to_row: {COUNT}\}}`"):
+    pattern = rf"the file ends early.*`keep: \{{to_row: {COUNT}\}}`"
+    with pytest.raises(TableUnfit, match=pattern):
         _read(tmp_path, lines, end="")
     keep = KeptPart(to_row=COUNT)
-    np.testing.assert_array_equal(_read(tmp_path, lines, end="", keep=keep).values, READ)
+    actual = _read(tmp_path, lines, end="", keep=keep).values
+    np.testing.assert_array_equal(actual, READ)
 
 
 def test_two_recordings_in_one_file_are_parted_by_the_settings_that_are_named(
@@ -401,10 +411,12 @@ def test_two_recordings_in_one_file_are_parted_by_the_settings_that_are_named(
     ) as caught:
         _read(tmp_path, lines)
     assert f"{{to_row: {COUNT}}}" in caught.value.remedy
-    assert f"{{from_row: {COUNT + 2}}}" in caught.value.remedy
+    expected = f"{{from_row: {COUNT + 2}}}"
+    assert expected in caught.value.remedy
     from_row = COUNT + 2
     for part in (KeptPart(to_row=COUNT), KeptPart(from_row=from_row)):
-        np.testing.assert_array_equal(_read(tmp_path, lines, keep=part).values, READ)
+        actual = _read(tmp_path, lines, keep=part).values
+        np.testing.assert_array_equal(actual, READ)
 
 
 def test_a_second_header_with_other_names_is_no_line_to_be_left_out(tmp_path: Path) -> None:
@@ -429,7 +441,8 @@ def test_rows_without_numbers_at_an_end_are_cut_by_the_setting_that_is_named(
         setting = f"from_row: {last + 2}"
     else:
         setting = f"to_row: {first}"
-    with pytest.raises(TableUnfit, match=rf"`keep: \{{{setting}\}}`"):
+    pattern = rf"`keep: \{{{setting}\}}`"
+    with pytest.raises(TableUnfit, match=pattern):
         _read(tmp_path, ["t,q,i", *rows])
     if first == 0:
         from_row = last + 2
@@ -438,7 +451,8 @@ def test_rows_without_numbers_at_an_end_are_cut_by_the_setting_that_is_named(
         part = KeptPart(to_row=first)
     kept = READ[last + 1 :] if first == 0 else READ[:first]
     lines = ["t,q,i", *rows]
-    np.testing.assert_array_equal(_read(tmp_path, lines, keep=part).values, kept)
+    actual = _read(tmp_path, lines, keep=part).values
+    np.testing.assert_array_equal(actual, kept)
 
 
 @pytest.mark.parametrize(
@@ -509,10 +523,13 @@ def test_any_lines_are_read_or_refused(
 @pytest.mark.parametrize("part", [KeptPart(from_row=100), KeptPart(from_s=5.0)])
 def test_a_part_with_nothing_in_it_is_refused(tmp_path: Path, part: KeptPart) -> None:
     lines = ["t,q,i", *ROWS]
+    pattern = (
+        rf"found {COUNT} rows.*none of them in "
+        r"`keep`.*correct `keep`"
+    )
     with pytest.raises(
         TableUnfit,
-        match=rf"found {COUNT} rows.*none of them in "
-        r"`keep`.*correct `keep`",
+        match=pattern,
     ):
         _read(tmp_path, lines, keep=part)
 

@@ -109,10 +109,9 @@ def test_a_decimal_comma_has_to_be_declared(tmp_path: Path) -> None:
 
 def test_a_point_under_a_decimal_comma_is_refused(tmp_path: Path) -> None:
     """Whole mA as 1.234 would be 1.234 A."""
-    rows = [
-        f"{0.5 * k};{1000 + k:,}".replace(".", "_").replace(",", ".").replace("_", ",")
-        for k in range(20)
-    ]
+    rows = []
+    for k in range(20):
+        rows.append(f"{0.5 * k};{1000 + k:,}".replace(".", "_").replace(",", ".").replace("_", ","))
     data = _text(*rows, header="q;i").encode()
     with pytest.raises(
         TableUnfit,
@@ -224,9 +223,9 @@ def _stamped(tmp_path: Path, unit: TimeUnit, stamps: list[str]) -> Table:
 def test_stamps_since_1970_are_exact_in_every_unit(tmp_path: Path, unit: TimeUnit) -> None:
     digits = 9 - unit.digits
     whole = [START_NS + STEP_NS * index for index in range(4)]
-    texts = [
-        f"{ns // 10**digits}.{ns % 10**digits:0{digits}d}" if digits else str(ns) for ns in whole
-    ]
+    texts = []
+    for ns in whole:
+        texts.append(f"{ns // 10**digits}.{ns % 10**digits:0{digits}d}" if digits else str(ns))
     stamps = _stamped(tmp_path, unit, texts).stamps
     assert stamps is not None
     assert stamps.first_ns == START_NS
@@ -280,9 +279,8 @@ def test_a_delimiter_in_quotes_belongs_to_its_field(tmp_path: Path, delimiter: s
 
     rows = [line(*row.split(",")).replace("state", "run auto") for row in ROWS]
     data = "\n".join((line('"q 1"', "i"), *rows, "")).encode()
-    np.testing.assert_array_equal(
-        _read(tmp_path, data, ("q 1", "i"), delimiter=delimiter).values, VALUES
-    )
+    actual = _read(tmp_path, data, ("q 1", "i"), delimiter=delimiter).values
+    np.testing.assert_array_equal(actual, VALUES)
     np.testing.assert_array_equal(_read(tmp_path, data, (2, 3), delimiter=delimiter).values, VALUES)
 
 
@@ -393,7 +391,8 @@ def test_a_counter_of_time_that_wraps_goes_on(
     stamps = [str(count) for count in counts]
     table = _stamped(tmp_path, unit, stamps)
     assert table.stamps is not None
-    assert table.stamps.time_s == pytest.approx(step * unit.seconds * np.arange(8.0), abs=1e-9)
+    expected = step * unit.seconds * np.arange(8.0)
+    assert table.stamps.time_s == pytest.approx(expected, abs=1e-9)
     assert f"a counter of {bits} bits in {unit.value} that wraps" in table.remarks[0]
 
 

@@ -20,6 +20,7 @@ from daq.log.export import TableFormat, export_log
 from daq.log.reader import BLOCK_SAMPLES
 from daq.log.writer import LogWriter
 from drivers.messages import CellEvent, EventKind, Quantity, Sample, SlowReading
+from tests.daq.command_line import run_verb
 from tests.daq.logs import START_NS, demo_content, joints, samples, write
 
 ROWS = 2 * BLOCK_SAMPLES + 100
@@ -34,10 +35,10 @@ def log(tmp_path_factory: pytest.TempPathFactory, checkout: Path) -> Path:
     counts = np.cumsum(steps, axis=0)
     rows = samples(counts.tolist())
     rows[7] = replace(rows[7], missing=0b100)
-    moves = [
-        CellEvent(START_NS + at * 1_000_000, None, EventKind.MOVE_START, number, "")
-        for number, at in ((0, 5), (1, 5000))
-    ]
+    moves = []
+    for number, at in ((0, 5), (1, 5000)):
+        time_ns = START_NS + at * 1_000_000
+        moves.append(CellEvent(time_ns, None, EventKind.MOVE_START, number, ""))
     path = tmp_path_factory.mktemp("log") / "bare.mcap"
     return write(path, demo_content(checkout), rows, moves)
 
@@ -151,10 +152,8 @@ def test_without_its_package_parquet_says_what_to_install(
     log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("daq.log.export.find_spec", lambda _name: None)
-    assert (
-        main(["export", "log", str(log), "--parquet", "--out", str(tmp_path / "x")])
-        == ExitCode.CONFIGURATION
-    )
+    code = run_verb("export", "log", log, "--parquet", "--out", tmp_path / "x")
+    assert code == ExitCode.CONFIGURATION
     assert "drivegain[parquet]" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 
@@ -163,7 +162,8 @@ def test_without_its_package_parquet_says_what_to_install(
 def test_one_kind_of_table_must_be_chosen(
     log: Path, tmp_path: Path, kinds: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["export", "log", str(log), *kinds, "--out", str(tmp_path / "x")]) == ExitCode.USAGE
+    code = run_verb("export", "log", log, *kinds, "--out", tmp_path / "x")
+    assert code == ExitCode.USAGE
     assert "one of them" in capsys.readouterr().err
 
 
@@ -175,13 +175,13 @@ def test_a_damaged_log_leaves_nothing_behind_and_nothing_is_overwritten(
     damaged = tmp_path / "damaged.mcap"
     damaged.write_bytes(data)
     out = tmp_path / "out.csv"
-    assert main(["export", "log", str(damaged), "--csv", "--out", str(out)]) == ExitCode.DATA_UNFIT
+    assert run_verb("export", "log", damaged, "--csv", "--out", out) == ExitCode.DATA_UNFIT
     assert sorted(tmp_path.iterdir()) == [damaged]
     out.write_text("mine")
-    assert main(["export", "log", str(log), "--csv", "--out", str(out)]) == ExitCode.USAGE
+    assert run_verb("export", "log", log, "--csv", "--out", out) == ExitCode.USAGE
     assert out.read_text() == "mine"
     missing = tmp_path / "absent" / "out.csv"
-    assert main(["export", "log", str(log), "--csv", "--out", str(missing)]) == ExitCode.UNEXPECTED
+    assert run_verb("export", "log", log, "--csv", "--out", missing) == ExitCode.UNEXPECTED
     assert "folder that can be written" in capsys.readouterr().err
 
 
@@ -195,10 +195,8 @@ def test_an_invalid_log_is_exported_and_called_invalid(
         samples([[0] * 6] * 3),
         verdict=(False, "2 late answers"),
     )
-    assert (
-        main(["export", "log", str(log), "--csv", "--out", str(tmp_path / "bad.csv")])
-        == ExitCode.OK
-    )
+    code = run_verb("export", "log", log, "--csv", "--out", tmp_path / "bad.csv")
+    assert code == ExitCode.OK
     assert "INVALID: 2 late answers" in capsys.readouterr().err
 
 

@@ -69,7 +69,8 @@ def test_a_console_gets_every_sample_and_event_in_their_order(cell_file: Path, c
             feed.finish()
             packets = [console.recv(LARGEST_PACKET) for _ in range(6)]
     heads = [HEAD.unpack_from(packet) for packet in packets]
-    document = json.loads(packets[0][HEAD.size :])
+    text = packets[0][HEAD.size :]
+    document = json.loads(text)
     axes = document["run"]["axes"]
     assert axes == list(cell.axis_names)
     numbers = [number - heads[0][1] for _, number, *_ in heads]
@@ -207,7 +208,8 @@ def test_a_feed_without_descriptors_says_so_and_one_that_ends_without_them_ends(
         with _without_descriptors():
             console.connect(socket_names(cell_file).feed)  # waits in vain
             feed.__exit__(None, None, None)
-            assert not any(thread.name == "drivegain feed" for thread in threading.enumerate())
+            for thread in threading.enumerate():
+                assert thread.name != "drivegain feed"
 
 
 def test_another_word_stops_nothing(cell_file: Path) -> None:

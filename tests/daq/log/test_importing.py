@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.io import savemat
 
-from daq.cli import main
+from daq.cli.app import main
 from daq.config.cell import model_of
 from daq.config.cell_file import load_cell
 from daq.config.import_description import ImportDescription
@@ -34,6 +34,7 @@ from daq.report.log import info_report
 from ident.data.channel_faults import FaultKind, find_faults
 from ident.data.torque_channel import torque_slope
 from ident.model.robot import Motion
+from tests.daq.command_line import run_verb
 from tests.studies.real_runs import ur10
 
 FloatArray = np.ndarray[tuple[int, ...], np.dtype[np.float64]]
@@ -49,7 +50,8 @@ class Bench:
         self.folder = folder
         self.data = folder / "data"
         self.out = folder / "out" / "run.mcap"
-        self.joint_deg = 20.0 * np.sin(np.arange(300)[:, None] / 40.0 + np.arange(6))
+        phase_rad = np.arange(300)[:, None] / 40.0 + np.arange(6)
+        self.joint_deg = 20.0 * np.sin(phase_rad)
         self.current_a = np.cos(np.arange(300)[:, None] / 7.0 + np.arange(6))
 
     def prepare(self) -> Bench:
@@ -70,7 +72,8 @@ class Bench:
             *(delimiter.join(map(repr, row)) for row in values.tolist()),
         ]
         run_path = self.data / "run.csv"
-        run_path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        text = "\n".join(lines) + "\n"
+        run_path.write_text(text, encoding="utf-8")
 
     def spoil_csv(self, old: str, new: str) -> None:
         """Replace something in the recording."""
@@ -87,11 +90,13 @@ class Bench:
 
     def describe(self, **changes: object) -> None:
         """The description, with some values replaced; None removes."""
+        position = {"file": "run.csv", "columns": NAMES[:6], "unit": "deg", "side": "joint"}
+        current = {"file": "run.csv", "columns": NAMES[6:], "unit": "A"}
         document: dict[str, object] = {
             "name": "run",
             "cell": "../cells/demo.yaml",
-            "position": {"file": "run.csv", "columns": NAMES[:6], "unit": "deg", "side": "joint"},
-            "current": {"file": "run.csv", "columns": NAMES[6:], "unit": "A"},
+            "position": position,
+            "current": current,
             "rate_hz": 1000,
         }
         document.update(changes)
@@ -103,9 +108,7 @@ class Bench:
 
     def run(self) -> int:
         """The command; its exit code."""
-        return main(
-            ["import", str(self.description), "--data", str(self.data), "--out", str(self.out)]
-        )
+        return run_verb("import", self.description, "--data", self.data, "--out", self.out)
 
     @property
     def left(self) -> list[str]:
@@ -202,7 +205,8 @@ def test_a_robot_with_a_joint_that_follows_an_axis_is_imported_by_its_axes(bench
     still = np.zeros_like(run.position_rad)
     joints = model_of(cell).follow(Motion(run.position_rad, still, still)).joints
     expected = np.radians(bench.joint_deg)
-    np.testing.assert_allclose(joints.position_rad[:, :6], expected, atol=2e-9)
+    actual = joints.position_rad[:, :6]
+    np.testing.assert_allclose(actual, expected, atol=2e-9)
     joint_rad = np.radians(bench.joint_deg[:, 4])
     np.testing.assert_allclose(joints.position_rad[:, 6], 0.1 - 0.5 * joint_rad, atol=2e-9)
 
@@ -469,7 +473,8 @@ def test_a_rate_that_is_ten_times_off_is_noticed(
 ) -> None:
     """At 1 kHz the joints reach 80 to 90 % of the slowest limit."""
     seconds = np.arange(1000)[:, None] / 1000.0
-    bench.joint_deg = 30.0 * np.sin(2.0 * np.pi * seconds + np.arange(6))
+    phase_rad = 2.0 * np.pi * seconds + np.arange(6)
+    bench.joint_deg = 30.0 * np.sin(phase_rad)
     bench.current_a = np.cos(seconds * 140.0 + np.arange(6))
     bench.joint_deg[500, 2] += 0.5  # one outlier is not taken for a wrong rate
     stacked_joint_deg = np.hstack((bench.joint_deg, bench.current_a))
@@ -563,7 +568,8 @@ def test_a_glitch_that_no_limit_rules_out_is_said_and_left_to_the_fit(
 
 
 def test_a_glitch_of_a_current_among_resampled_rows_does_not_reach_the_log(bench: Bench) -> None:
-    bench.joint_deg = 20.0 * np.sin(UNEVEN_MS[:, None] / 160.0 + np.arange(6))
+    phase_rad = UNEVEN_MS[:, None] / 160.0 + np.arange(6)
+    bench.joint_deg = 20.0 * np.sin(phase_rad)
     stacked_joint_deg = np.hstack((bench.joint_deg, bench.current_a))
     bench.write_csv(stacked_joint_deg)
     _with_time(bench, UNEVEN_MS)
@@ -592,7 +598,8 @@ def test_an_axis_at_rest_may_have_no_current(bench: Bench) -> None:
 def test_a_step_is_found_in_resampled_samples_too(
     bench: Bench, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    bench.joint_deg = 20.0 * np.sin(UNEVEN_MS[:, None] / 160.0 + np.arange(6))
+    phase_rad = UNEVEN_MS[:, None] / 160.0 + np.arange(6)
+    bench.joint_deg = 20.0 * np.sin(phase_rad)
     bench.joint_deg[150:, 3] += np.degrees(0.5)
     stacked_joint_deg = np.hstack((bench.joint_deg, bench.current_a))
     bench.write_csv(stacked_joint_deg)
@@ -617,7 +624,8 @@ def test_a_counter_of_fewer_than_32_bits_that_wraps(
     counts_from_zero = counts[:, 0] - least
     wrapped = counts_from_zero % 2**bits + least
     absolute_wrapped_step = np.abs(np.diff(wrapped))
-    assert absolute_wrapped_step.max() > 2 ** (bits - 1)
+    lower_limit = 2 ** (bits - 1)
+    assert absolute_wrapped_step.max() > lower_limit
     counts[:, 0] = wrapped
     stacked_counts = np.hstack((counts, bench.current_a))
     bench.write_csv(stacked_counts)
@@ -716,7 +724,8 @@ def test_a_last_number_that_may_lack_digits(
     bench: Bench, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = bench.data / "run.csv"
-    path.write_bytes(path.read_bytes()[:-3])
+    content = path.read_bytes()[:-3]
+    path.write_bytes(content)
     _refused(bench, capsys, 4, "without an end of line")
 
 
@@ -737,7 +746,8 @@ def _with_time(
         "t," + lines[0],
         *(f"{t!r},{line}" for t, line in zip(time_s.tolist(), lines[1:], strict=True)),
     ]
-    (bench.data / "run.csv").write_text("\n".join(timed) + "\n", encoding="utf-8")
+    text = "\n".join(timed) + "\n"
+    (bench.data / "run.csv").write_text(text, encoding="utf-8")
     time = {"file": "run.csv", "column": "t", "unit": "ms"}
     bench.describe(rate_hz=None, time=time)
 
@@ -759,7 +769,8 @@ def test_the_rate_of_a_time_column(bench: Bench) -> None:
 def test_a_jump_in_the_time_column(bench: Bench, index: int, shift: float) -> None:
     time_s = 4.0 * np.arange(300) + shift * (np.arange(300) >= index)
     _with_time(bench, time_s)
-    with pytest.raises(TableUnfit, match=rf"run\.csv:{index + 2}, column t"):
+    pattern = rf"run\.csv:{index + 2}, column t"
+    with pytest.raises(TableUnfit, match=pattern):
         import_recording(bench.description, bench.data, bench.out, software="x")
     assert bench.left == []
 
@@ -939,9 +950,9 @@ def test_a_date_in_a_file_is_when_the_run_began(bench: Bench) -> None:
     _with_time(bench, np.arange(300.0))
     path = bench.data / "run.csv"
     head, *rows = path.read_text(encoding="utf-8").splitlines()
-    dated = [
-        f"2026-03-01T08:00:{index // 100:02d}.{index % 100:02d}+01:00," for index in range(300)
-    ]
+    dated = []
+    for index in range(300):
+        dated.append(f"2026-03-01T08:00:{index // 100:02d}.{index % 100:02d}+01:00,")
     text = "\n".join(
         [head, *(date + row.partition(",")[2] for date, row in zip(dated, rows, strict=True))]
     )
@@ -992,9 +1003,9 @@ def test_a_factor_for_each_axis(bench: Bench, mapping: bool) -> None:
     current = {"file": "run.csv", "columns": NAMES[6:], "unit": "A", "factor": factor}
     bench.describe(current=current)
     assert bench.run() == 0
-    np.testing.assert_allclose(
-        load_run(bench.out)[0].current_a, bench.current_a * factors, atol=3e-9
-    )
+    actual = load_run(bench.out)[0].current_a
+    expected = bench.current_a * factors
+    np.testing.assert_allclose(actual, expected, atol=3e-9)
 
 
 @pytest.mark.parametrize(
@@ -1029,7 +1040,8 @@ def _with_velocity(bench: Bench, velocity_deg_s: FloatArray, **changes: object) 
 
 
 def _velocity_deg_s() -> FloatArray:
-    return 20.0 / 0.040 * np.cos(np.arange(300)[:, None] / 40.0 + np.arange(6))
+    phase_rad = np.arange(300)[:, None] / 40.0 + np.arange(6)
+    return 20.0 / 0.040 * np.cos(phase_rad)
 
 
 @pytest.mark.parametrize("side", ["joint", "motor"])
@@ -1157,7 +1169,8 @@ def with_slow_columns(
     values = np.hstack((torque_nm, temperature_c)).tolist()
     lines = [",".join(names), *(",".join(map(repr, row)) for row in values)]
     slow_path = bench.data / "slow.csv"
-    slow_path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    text = "\n".join(lines) + "\n"
+    slow_path.write_text(text, encoding="utf-8")
     temperature = {"file": "slow.csv", "columns": names[6:]}
     bench.describe(
         rate_hz=50,
@@ -1279,7 +1292,8 @@ def _two_files(bench: Bench) -> None:
         ("current.csv", NAMES[6:], bench.current_a),
     ):
         lines = [",".join(names), *(",".join(map(repr, row)) for row in values.tolist())]
-        (bench.data / name).write_text("\n".join(lines) + "\n", encoding="utf-8")
+        text = "\n".join(lines) + "\n"
+        (bench.data / name).write_text(text, encoding="utf-8")
 
 
 def test_times_that_are_kept_are_rows_of_the_other_file(bench: Bench) -> None:
@@ -1366,7 +1380,8 @@ def test_a_held_out_end_becomes_a_log_of_its_own(bench: Bench, timed: bool) -> N
     if timed:
         started_s = runs[1].started_s
         assert started_s == pytest.approx(1_772_348_400.8, abs=1e-3)
-    assert read_log(bench.out).head.run.run_id != read_log(held_out).head.run.run_id
+    run_id = read_log(bench.out).head.run.run_id
+    assert run_id != read_log(held_out).head.run.run_id
 
 
 def test_the_command_writes_both_logs_and_reports_them(
@@ -1450,7 +1465,8 @@ def _file_of_each_axis(bench: Bench, later_s: float = 0.0, began_s: float = 0.0)
         stamps = began_s + 0.004 * np.arange(300) + (later_s if axis == 2 else 0.0)
         columns = np.column_stack((stamps, bench.joint_deg[:, axis], bench.current_a[:, axis]))
         lines = ["t,position,current", *(",".join(map(repr, row)) for row in columns.tolist())]
-        (bench.data / f"axis{axis + 1}.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+        text = "\n".join(lines) + "\n"
+        (bench.data / f"axis{axis + 1}.csv").write_text(text, encoding="utf-8")
     files = [f"axis{axis + 1}.csv" for axis in range(6)]
     current = {"file": files, "columns": ["current"] * 6, "unit": "A"}
     position = {"file": files, "columns": ["position"], "unit": "deg", "side": "joint"}
@@ -1629,7 +1645,8 @@ def test_a_reversed_axis_that_is_none_is_refused(
         "reversed": ["J9"],
     }
     if key == "velocity":
-        section |= {"unit": "deg/s", "columns": [f"v{axis}" for axis in range(6)]}
+        columns = [f"v{axis}" for axis in range(6)]
+        section |= {"unit": "deg/s", "columns": columns}
     bench.describe(**{key: section})
     _refused(bench, capsys, 6, f"{key}.reversed", "J9", "some of J1, J2")
 

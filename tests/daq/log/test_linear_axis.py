@@ -16,6 +16,7 @@ from daq.errors import ExitCode
 from daq.log.conversion import load_run
 from ident.estimators.identify import identify
 from ident.estimators.method import Method
+from tests.daq.command_line import run_verb
 
 URDF = """<robot name="slide"><link name="base"/>
 <link name="carriage"><inertial><mass value="{mass}"/>
@@ -36,11 +37,13 @@ GAIN_N_V = 35.0
 @pytest.fixture
 def slide(tmp_path: Path) -> Path:
     """A cell file and the recording of a slide that goes to and fro, with rests."""
-    (tmp_path / "slide.urdf").write_text(URDF.format(mass=MASS_KG, kind="prismatic"))
+    text = URDF.format(mass=MASS_KG, kind="prismatic")
+    (tmp_path / "slide.urdf").write_text(text)
     (tmp_path / "cell.yaml").write_text(CELL)
     time_s = np.arange(0.0, 30.0, 0.002)
     phase = np.minimum(time_s % 1.5, 1.0)
-    way = (1.0 - np.cos(np.pi * phase)) / 2.0
+    phase_rad = np.pi * phase
+    way = (1.0 - np.cos(phase_rad)) / 2.0
     there = np.floor(time_s / 1.5)
     ends = 0.3 * np.sin(1.0 + 2.0 * np.arange(40))
     end_difference = ends[there.astype(int) + 1] - ends[there.astype(int)]
@@ -58,23 +61,18 @@ def slide(tmp_path: Path) -> Path:
 
 def _import(folder: Path, unit: str) -> int:
     """Import the recording by its column in that unit."""
+    position = {"file": "run.csv", "columns": [unit], "unit": unit, "side": "joint"}
+    current = {"file": "run.csv", "columns": ["V"], "unit": "V"}
     description = {
         "name": "run",
         "cell": "cell.yaml",
-        "position": {"file": "run.csv", "columns": [unit], "unit": unit, "side": "joint"},
-        "current": {"file": "run.csv", "columns": ["V"], "unit": "V"},
+        "position": position,
+        "current": current,
         "rate_hz": 500,
     }
     (folder / f"{unit}.yaml").write_text(json.dumps(description))
-    return main(
-        [
-            "import",
-            str(folder / f"{unit}.yaml"),
-            "--data",
-            str(folder),
-            "--out",
-            str(folder / f"{unit}.mcap"),
-        ]
+    return run_verb(
+        "import", folder / f"{unit}.yaml", "--data", folder, "--out", folder / f"{unit}.mcap"
     )
 
 
@@ -99,7 +97,8 @@ def test_metres_and_millimetres_are_the_same_run(slide: Path) -> None:
 
 
 def test_metres_of_an_axis_that_turns(slide: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (slide / "slide.urdf").write_text(URDF.format(mass=MASS_KG, kind="revolute"))
+    text = URDF.format(mass=MASS_KG, kind="revolute")
+    (slide / "slide.urdf").write_text(text)
     changed_cell = CELL.replace("N/V", "Nm/V")
     turning = changed_cell.replace("_mm", "_deg").replace("-800, 800", "-50, 50")
     (slide / "cell.yaml").write_text(turning)

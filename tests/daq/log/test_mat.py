@@ -17,12 +17,12 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays, floating_dtypes, integer_dtypes
 from scipy.io import savemat
 
-from daq.cli import main
 from daq.config.import_description import ImportDescription, KeptPart, TimeColumn, TimeUnit
 from daq.errors import TableUnfit
 from daq.log.conversion import load_run
 from daq.log.mat_table import read_mat
 from daq.log.table import Table
+from tests.daq.command_line import run_verb
 from tests.daq.logs import damaged
 
 ROWS = 300
@@ -41,11 +41,13 @@ def test_matrices_vectors_and_fields_are_read(packed: bool, tmp_path: Path) -> N
     clock_ns = 1_700_000_000_123_456_789 + 4_000_000 * np.arange(ROWS, dtype=np.uint64)
     seconds = np.arange(ROWS) * 4e-3
     current = CURRENT.T.astype(np.float32)
+    counts = (1000.0 * Q).astype(np.int16)
+    run = {"counts": counts, "t": clock_ns, "note": "bare"}
     variables = {
         "q": Q,
         "turned": np.asfortranarray(current),
         "t": seconds,
-        "run": {"counts": (1000.0 * Q).astype(np.int16), "t": clock_ns, "note": "bare"},
+        "run": run,
     }
     path = tmp_path / "run.mat"
     savemat(path, variables, do_compression=packed)
@@ -179,7 +181,8 @@ def test_cells_in_cells_are_not_followed(tmp_path: Path) -> None:
         heads.append(struct.pack("<II", 14, size) + head)
         size += 8
     path = tmp_path / "deep.mat"
-    path.write_bytes(HEADER + b"".join(reversed(heads)))
+    content = HEADER + b"".join(reversed(heads))
+    path.write_bytes(content)
     with pytest.raises(TableUnfit, match="q, a cell array; expected real numbers"):
         read(path, "q")
 
@@ -206,7 +209,8 @@ def test_a_bomb_is_not_unpacked(tmp_path: Path) -> None:
     )
     packed = zlib.compress(struct.pack("<II", 14, 2**30) + head + bytes(2**20))
     path = tmp_path / "bomb.mat"
-    path.write_bytes(HEADER + struct.pack("<II", 15, len(packed)) + packed)
+    content = HEADER + struct.pack("<II", 15, len(packed)) + packed
+    path.write_bytes(content)
     with pytest.raises(TableUnfit, match=r"\d+ bytes that unfold to 1073741824"):
         read(path, "q.1")
 
@@ -236,7 +240,8 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> tuple[bytes, bytes]:
     made = []
     for packed in (False, True):
         path = tmp_path_factory.mktemp("mat") / "run.mat"
-        savemat(path, {"run": {"q": Q[:20], "note": "x"}, "q": Q[:20]}, do_compression=packed)
+        run = {"q": Q[:20], "note": "x"}
+        savemat(path, {"run": run, "q": Q[:20]}, do_compression=packed)
         made.append(path.read_bytes())
     return made[0], made[1]
 
@@ -245,15 +250,18 @@ def test_a_matrix_is_imported_with_its_columns_as_axes(checkout: Path, tmp_path:
     savemat(tmp_path / "run.mat", {"q": Q, "run": {"i": CURRENT, "t": np.arange(ROWS) * 1e-3}})
     description = tmp_path / "run.yaml"
     out = tmp_path / "log.mcap"
+    position = {"file": "run.mat", "columns": ["q"], "unit": "deg", "side": "joint"}
+    current = {"file": "run.mat", "columns": ["run.i"], "unit": "A"}
+    cell = str(checkout / "configs/cells/demo.yaml")
     document = {
         "name": "run",
-        "cell": str(checkout / "configs/cells/demo.yaml"),
-        "position": {"file": "run.mat", "columns": ["q"], "unit": "deg", "side": "joint"},
-        "current": {"file": "run.mat", "columns": ["run.i"], "unit": "A"},
+        "cell": cell,
+        "position": position,
+        "current": current,
         "time": {"file": "run.mat", "column": "run.t", "unit": "s"},
     }
     description.write_text(json.dumps(document))
-    assert main(["import", str(description), "--data", str(tmp_path), "--out", str(out)]) == 0
+    assert run_verb("import", description, "--data", tmp_path, "--out", out) == 0
     run, _ = load_run(out)
     assert run.rate_hz == pytest.approx(1000.0)
     np.testing.assert_allclose(run.position_rad, np.radians(Q), atol=2e-9)
@@ -289,8 +297,10 @@ def test_a_part_of_a_matrix_is_kept_by_rows_and_by_times(tmp_path: Path) -> None
     with pytest.raises(TableUnfit, match=r"row 1, column q: found nan.*`keep: \{from_row: 6\}`"):
         read_mat(path, ImportDescription.model_construct(), ("q",), column)
     for part in (KeptPart(from_row=6), KeptPart(from_s=0.05)):
-        table = read_mat(path, ImportDescription.model_construct(keep=part), ("q",), column)
-        np.testing.assert_array_equal(table.values[:, 0], values[5:])
+        wanted = ImportDescription.model_construct(keep=part)
+        table = read_mat(path, wanted, ("q",), column)
+        actual = table.values[:, 0]
+        np.testing.assert_array_equal(actual, values[5:])
         assert table.stamps is not None
         assert table.stamps.first_ns == 50_000_000
         assert table.place(0, "q") == f"{path}, row 6, column q"
@@ -304,5 +314,6 @@ def test_a_counter_of_time_that_wraps_goes_on(kind: type, tmp_path: Path) -> Non
     column = TimeColumn(file="run.mat", column="t", unit=TimeUnit.MICROSECOND)
     table = read_mat(path, ImportDescription.model_construct(), ("q",), column)
     assert table.stamps is not None
-    assert table.stamps.time_s == pytest.approx(0.01 * np.arange(6), abs=1e-9)
+    expected = 0.01 * np.arange(6)
+    assert table.stamps.time_s == pytest.approx(expected, abs=1e-9)
     assert "a counter of 32 bits in us that wraps" in table.remarks[0]

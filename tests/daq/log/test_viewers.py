@@ -50,14 +50,13 @@ def test_the_messages_are_those_that_were_written(decoded: dict[str, list[Any]])
     position_counts = [list(message.position_counts) for message in decoded["/cell/samples"]]
     assert position_counts == rising_counts(ROWS, AXES)
     first = decoded["/cell/samples"][0]
-    assert first.stamp.sec * 10**9 + first.stamp.nanosec == START_NS
+    found = first.stamp.sec * 10**9 + first.stamp.nanosec
+    assert found == START_NS
     (event,) = decoded["/cell/events"]
-    assert (event.axis, event.kind, event.code, event.text) == (
-        2,
-        "emcy",
-        0x8611,
-        "node 3: following error",
-    )
+    assert event.axis == 2
+    assert event.kind == "emcy"
+    assert event.code == 0x8611
+    assert event.text == "node 3: following error"
     first_joint_state = decoded["/joint_states"][0]
     assert list(first_joint_state.name) == [f"J{number}" for number in range(1, AXES + 1)]
 
@@ -71,7 +70,8 @@ def _foxglove_paths() -> list[str]:
         topics = [layer["topic"] for layer in layers if "topic" in layer]
         found += topics + list(panel.get("topics", ()))
         panels = [panel[key] for key in ("topicPath",) if key in panel]
-        found += [path["value"] for path in panel.get("paths", ())] + panels
+        paths = panel.get("paths", ())
+        found += [path["value"] for path in paths] + panels
     return found
 
 
@@ -126,7 +126,8 @@ def test_every_panel_of_the_foxglove_layout_is_placed_once() -> None:
             return [node]
         return leaves(node["first"]) + leaves(node["second"])
 
-    assert sorted(leaves(layout["layout"])) == sorted(layout["configById"])
+    orders = leaves(layout["layout"])
+    assert sorted(orders) == sorted(layout["configById"])
 
 
 def test_the_layouts_show_all_axes_and_nothing_twice() -> None:

@@ -54,6 +54,7 @@ from tests.daq.calibrations import (
     demo_recording,
     with_recordings,
 )
+from tests.daq.command_line import run_verb
 
 NOW = RECORDED + timedelta(hours=1)
 HOSTILE = '<script>alert("x")</script>&<img src=http://example.org/x>'
@@ -72,7 +73,8 @@ class Reader(HTMLParser):
         assert self.open == []
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        assert not any(name in {"src", "href"} or name.startswith("on") for name, _ in attrs)
+        for name, _ in attrs:
+            assert not (name in {"src", "href"} or name.startswith("on"))
         self.tags.append(tag)
         if tag != "meta":
             self.open.append(tag)
@@ -121,9 +123,11 @@ def test_every_number_of_the_document_is_on_the_page() -> None:
     after = report.holdout_error_percent
     assert before is not None
     assert after is not None
-    assert f"{before.total:.2f} → {after.total:.2f}" in page.texts
+    expected = f"{before.total:.2f} → {after.total:.2f}"
+    assert expected in page.texts
     for first, second in zip(before.axes, after.axes, strict=True):
-        assert f"{first:.2f} → {second:.2f}" in page.texts
+        expected = f"{first:.2f} → {second:.2f}"
+        assert expected in page.texts
     for value in report.identity.values():
         assert value in page.texts
 
@@ -156,7 +160,8 @@ def test_the_dependence_of_the_gains_on_the_mass_is_on_the_sheet_and_in_the_deta
     assert "if the mass of disc is wrong by 1 %, every gain is wrong by 1 %" in sheet
     assert "4.59 kg ± 0.0459 kg, which is ± 1 % of every gain, not included in σ" in sheet
     assert "Dependence of the gains on the payload's mass" in texts
-    assert f"{gains[0].value / 4.59:.4g}" in texts
+    expected = f"{gains[0].value / 4.59:.4g}"
+    assert expected in texts
     # With the drawing known too, each gain has a number.
     shares = np.linspace(0.1, 0.6, len(gains))
     slopes = [share * gain.value / 4.59 for share, gain in zip(shares, gains, strict=True)]
@@ -164,13 +169,16 @@ def test_the_dependence_of_the_gains_on_the_mass_is_on_the_sheet_and_in_the_deta
     drawn = replace(calibration, payload_mass=payload_mass)
     reader = Reader(_page(drawn))
     sheet = next(text for text in reader.texts if text.startswith("disc: 4.59 kg in the cell file"))
-    assert f"the gains are wrong by: {gains[0].axis} 0.10 %, " in sheet
+    expected = f"the gains are wrong by: {gains[0].axis} 0.10 %, "
+    assert expected in sheet
     assert "which is at most ± 0.6 % of every gain, not included in σ" in sheet
     comparison = without_controller(drawn, "", NOW)
     certificate = certify(drawn, comparison)
     report = json_tree(certificate_report(certificate))
     (found,) = report["payload_mass"]
-    assert (found["payload"], found["mass_kg"], found["tolerance_kg"]) == ("disc", 4.59, 0.0459)
+    assert found["payload"] == "disc"
+    assert found["mass_kg"] == 4.59
+    assert found["tolerance_kg"] == 0.0459
     for one, gain, share in zip(found["gains"], gains, shares, strict=True):
         assert one["axis"] == gain.axis
         assert one["percent_per_percent"] == pytest.approx(share)
@@ -213,7 +221,8 @@ def test_a_term_without_a_name_is_its_curve() -> None:
     for internal in ("lower", "upper", "other_axis", "signed", "part 7", "2.38838"):
         assert internal not in text.partition("</style>")[2]
     first_effect = calibration.effects[0]
-    assert size_text(first_effect, calibration) in " ".join(Reader(text).texts)
+    texts = Reader(text).texts
+    assert size_text(first_effect, calibration) in " ".join(texts)
 
 
 def test_a_loss_beside_a_rotor_shows_the_inertia_of_the_rotor() -> None:
@@ -375,15 +384,14 @@ def test_the_verb_writes_one_page_and_never_over_another_file(
     save_calibration(demo_calibration(), file)
     cells_folder = checkout / "configs" / "cells"
     cell = str(cells_folder / "demo.yaml")
-    assert (
-        main(["certificate", str(file), "--cell", cell, "--beside", str(file), "--json"])
-        == ExitCode.OK
-    )
+    code = run_verb("certificate", file, "--cell", cell, "--beside", file, "--json")
+    assert code == ExitCode.OK
     document = json.loads(capsys.readouterr().out)
     # The configuration of the demo cell is not the one that the calibration names.
     assert document["verdict"] == "refused"
     expected = [f"drives.J{number}.gain" for number in range(1, 7)]
-    assert [axis["key"] for axis in document["axes"]] == expected
+    keys = [axis["key"] for axis in document["axes"]]
+    assert keys == expected
     # J4 went from -11.52 to -9.21: its size decreased. The current gain is no calibration's.
     change_sigmas = document["axes"][3]["change_sigmas"]
     assert change_sigmas < 0.0 < document["axes"][0]["change_sigmas"]
@@ -394,14 +402,16 @@ def test_the_verb_writes_one_page_and_never_over_another_file(
     ) in texts
     # Of gains that must not be written the page does not show what would be.
     assert not {axis["written"] for axis in document["axes"]} & set(texts)
-    assert not any("would be written" in text for text in texts)
-    assert main(["certificate", str(file), "--json"]) == ExitCode.OK
+    for text in texts:
+        assert "would be written" not in text
+    assert run_verb("certificate", file, "--json") == ExitCode.OK
     printed = capsys.readouterr().out
     unread = json.loads(printed)["axes"]
-    assert all(axis["key"] is axis["line"] is None for axis in unread)
+    for axis in unread:
+        assert axis["key"] is axis["line"] is None
     assert "the nameplate is taken as exact on all axes." in page.read_text(encoding="utf-8")
     page.write_text("the user's own", encoding="utf-8")
-    assert main(["certificate", str(file)]) == ExitCode.USAGE
+    assert run_verb("certificate", file) == ExitCode.USAGE
     assert page.read_text(encoding="utf-8") == "the user's own"
 
 
@@ -473,7 +483,8 @@ def test_gains_that_are_not_written_may_be_written_and_what_would_be_is_shown(
     assert write is acceptance is None
     texts = Reader(certificate_page(certificate)).texts
     assert "What would be written into controllers/demo.yaml" in texts
-    assert {axis["written"] for axis in document["axes"]} <= set(texts)
+    writtens = {axis["written"] for axis in document["axes"]}
+    assert writtens <= set(texts)
     assert any(text.startswith("not written (as of ") for text in texts)
 
 
@@ -518,7 +529,7 @@ def test_gains_that_were_written_are_shown_as_written_beside_the_previous_ones(
 def test_a_write_that_was_rolled_back_is_not_in_force(cell_file: Path) -> None:
     calibration_file = calibration_for(cell_file)
     _apply(cell_file, calibration_file)
-    assert main(["rollback", str(cell_file), "--by", "B. Ode"]) == ExitCode.OK
+    assert run_verb("rollback", cell_file, "--by", "B. Ode") == ExitCode.OK
     certificate = _certificate(cell_file, calibration_file)
     document = _document(certificate)
     assert document["status"]["state"] == "replaced"
@@ -565,7 +576,8 @@ def _recorded_in_order(payloads: str) -> tuple[Source, ...]:
     """
     sources: list[Source] = []
     for place, kind in enumerate(payloads):
-        recording = replace(demo_recording(), recorded_s=1.7e9 + 60.0 * place)
+        recorded_s = 1.7e9 + 60.0 * place
+        recording = replace(demo_recording(), recorded_s=recorded_s)
         payload = "disc" if kind == "l" else None
         source = Source(f"r{place}", f"{place:064x}", "fit", payload=payload, recording=recording)
         sources.append(source)
@@ -590,9 +602,8 @@ def test_the_order_of_runs_says_whether_a_warm_up_moves_the_gains(payloads: str,
 def test_with_friction_by_payload_no_order_of_runs_moves_the_gains() -> None:
     by_payload = tuple(Parameter(f"fs{axis}_loaded", -0.4, 0.1, "Nm") for axis in range(1, 7))
     declared = demo_calibration()
-    calibration = replace(
-        declared, sources=_recorded_in_order("bbll"), parameters=(*declared.parameters, *by_payload)
-    )
+    parameters = (*declared.parameters, *by_payload)
+    calibration = replace(declared, sources=_recorded_in_order("bbll"), parameters=parameters)
     said = "bare, bare, loaded, loaded; friction by payload: its change between them moves no gain"
     assert order_text(calibration) == said
     lacking = replace(calibration, parameters=calibration.parameters[:-1])
@@ -609,10 +620,11 @@ def test_an_order_that_no_clock_tells_is_not_said() -> None:
 def test_an_accepted_calibration_says_when_and_by_whom(cell_file: Path) -> None:
     calibration_file = calibration_for(cell_file)
     _apply(cell_file, calibration_file)
+    calibration_sha256 = sha256(calibration_file.read_bytes())
     details = {
         "session": "x",
         "cell": "demo",
-        "calibration_sha256": sha256(calibration_file.read_bytes()),
+        "calibration_sha256": calibration_sha256,
     }
     audit = cell_file.with_name("demo.audit.jsonl")
     record_session(
@@ -687,7 +699,7 @@ def test_without_a_cell_the_status_is_not_known(
 ) -> None:
     file = tmp_path / "calibration.yaml"
     save_calibration(demo_calibration(), file)
-    assert main(["certificate", str(file), "--json"]) == ExitCode.OK
+    assert run_verb("certificate", file, "--json") == ExitCode.OK
     document = json.loads(capsys.readouterr().out)
     assert document["status"]["state"] == "not known"
     assert document["status"]["as_of"] is None
@@ -720,7 +732,7 @@ def test_a_calibration_in_a_session_names_it_and_another_one_in_its_folder_does_
     assert session is None
     calibration = tmp_path / "calibration.yaml"
     assert session_of(calibration, digest) is None
-    assert main(["certificate", str(file), "--json"]) == ExitCode.OK
+    assert run_verb("certificate", file, "--json") == ExitCode.OK
     document = json.loads(capsys.readouterr().out)
     assert document["session"] == folder.name
     text = file.with_suffix(".html").read_text(encoding="utf-8")
@@ -751,7 +763,7 @@ def test_the_earlier_name_of_the_verb_writes_the_same_page(
     found = []
     for verb in ("certificate", "report"):
         page = tmp_path / f"{verb}.html"
-        assert main([verb, str(file), "--out", str(page), "--json"]) == ExitCode.OK
+        assert run_verb(verb, file, "--out", page, "--json") == ExitCode.OK
         printed = capsys.readouterr().out
         found.append((page.read_bytes(), printed))
     assert found[0] == found[1]

@@ -70,10 +70,9 @@ def full_calibration(cell_file: Path) -> Calibration:
     smooth = AcceptedEffect(placed.effect.name, "J2", settings, weights, 5.0, 3.0)
     of_load = made.effects[0]
     at = datetime.fromisoformat(made.created) - timedelta(hours=1)
-    bare = [
-        Source(name, sha256(name.encode()), "fit", recording=demo_recording(at=at))
-        for name in ("bare-1", "bare-2")
-    ]
+    bare = []
+    for name in ("bare-1", "bare-2"):
+        bare.append(Source(name, sha256(name.encode()), "fit", recording=demo_recording(at=at)))
     loaded = [
         Source(name, sha256(name.encode()), role, False, "disc", 4.59, demo_recording(4.59, at))
         for name, role in (("loaded-1", "fit"), ("loaded-2", "fit"), ("held-out", "holdout"))

@@ -31,5 +31,6 @@ def test_the_head_and_the_report_name_the_same_parameters() -> None:
         basis=basis,
         shares=shares,
     )
-    assert [one.name for one in chosen_parameters(choice)] == ["m1", "fv1"]
+    names = [one.name for one in chosen_parameters(choice)]
+    assert names == ["m1", "fv1"]
     assert names_by_prior(choice) == ["m1"]

@@ -51,11 +51,12 @@ def test_a_name_of_any_bytes_comes_back_from_the_document(name: str) -> None:
 def test_a_number_that_json_lacks_is_null_wherever_it_is(number: float) -> None:
     parts = [Part(name="J1", sigma=number)]
     made = Whole(parts=parts, sizes=(1.0, number), by_name={"J1": number})
-    assert json_tree(made) == {
+    expected = {
         "parts": [{"name": "J1", "sigma": None}],
         "sizes": [1.0, None],
         "by_name": {"J1": None},
     }
+    assert json_tree(made) == expected
 
 
 def test_a_key_with_a_default_is_there_where_it_was_given() -> None:
@@ -88,12 +89,14 @@ def test_a_document_takes_the_attributes_of_its_sources_by_name_and_the_first_so
     two = Measured(Path("b"), 2.0)
     made = Measurement.of(one, two, first=two, parts=(one, two), sigma=two.sigma)
     part = {"name": "b", "sigma": 2.0}
-    assert json_tree(made) == {
+    parts = [{"name": "a", "sigma": None}, part]
+    expected = {
         "first": part,
-        "parts": [{"name": "a", "sigma": None}, part],
+        "parts": parts,
         "name": "a",
         "sigma": 2.0,
     }
+    assert json_tree(made) == expected
 
 
 def test_a_source_that_is_none_gives_null_to_what_the_others_lack() -> None:

@@ -40,7 +40,8 @@ def test_another_mistake_of_the_description_is_named_beside_gravity(
     (note,) = geometry_notes(CHECK, AXES, robot, (diagnosis,))
     assert "0.18 ± 0.04°" in note
     assert note.startswith("With the description as it is") == bool(expected)
-    assert all(f"({name} not corrected)" in note for name in expected)
+    for name in expected:
+        assert f"({name} not corrected)" in note
     found = checked_geometry(CHECK, AXES, robot, (diagnosis,))
     assert found is not None
     assert found.gravity is not None

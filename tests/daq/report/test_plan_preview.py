@@ -86,7 +86,9 @@ def test_a_capsule_is_where_the_arm_is_and_the_clearance_that_of_the_checker(
     for capsule, ends in zip(capsules, drawn["ends_m"][0], strict=True):
         rotation = at.rotation[capsule.link + 1, 0]
         origin = at.origin_m[capsule.link + 1, 0]
-        expected = [rotation @ np.array(end) + origin for end in (capsule.start_m, capsule.end_m)]
+        expected = []
+        for end in (capsule.start_m, capsule.end_m):
+            expected.append(rotation @ np.array(end) + origin)
         np.testing.assert_allclose(ends, expected, atol=0.001)
     last_target = TARGETS[-1]
     position = np.array([TARGETS[0], last_target])
@@ -159,7 +161,8 @@ def test_a_preview_is_found_by_the_content_of_its_plan(
     plan.write_bytes(b"moves")
     (tmp_path / "another.html").write_text("<html>")
     assert find_preview(plan) is None
-    (tmp_path / "look.html").write_text(preview_page(walled_cell, MOVES, checker, b"moves"))
+    text = preview_page(walled_cell, MOVES, checker, b"moves")
+    (tmp_path / "look.html").write_text(text)
     assert find_preview(plan) == tmp_path / "look.html"
     plan.write_bytes(b"other moves")
     assert find_preview(plan) is None

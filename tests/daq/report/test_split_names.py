@@ -47,7 +47,9 @@ def test_one_name_where_the_added_effect_is_best_without_each_fold(evidence: Evi
     added = _found(FRICTION, squares, LOSS)
     step = _turn(evidence, added, _found(LOSS, np.full(FOLDS, 1.2)))
     (only,) = names_by_split(step)
-    assert (only.placed, only.splits, only.of) == (FRICTION, FOLDS, FOLDS)
+    assert only.placed == FRICTION
+    assert only.splits == FOLDS
+    assert only.of == FOLDS
 
 
 def test_two_names_where_one_fold_decides(evidence: Evidence) -> None:

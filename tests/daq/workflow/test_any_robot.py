@@ -51,7 +51,9 @@ def _spoil(path: Path, *changes: tuple[str, str]) -> Path:
 
 def test_the_gantry_is_read_in_si_units() -> None:
     x, _, z, a, _ = GANTRY.axes
-    assert (x.unit, z.unit, a.unit) == (MILLIMETRE, MILLIMETRE, DEGREE)
+    assert x.unit == MILLIMETRE
+    assert z.unit == MILLIMETRE
+    assert a.unit == DEGREE
     assert x.limits.position == pytest.approx((0.0, 1.4))
     assert (z.limits.velocity, z.limits.acceleration) == pytest.approx((0.6, 4.5))
     expected = (radians(-175), radians(175))
@@ -75,9 +77,8 @@ def test_a_turn_of_the_screw_is_its_lead() -> None:
     counts = np.array([0, 0, 65536, 0, 0])
     assert scale.joint_position(counts) == pytest.approx([0, 0, 0.020, 0, 0])
     # Both belt motors a turn forwards: X alone moves, by a fifth of the pulley's circumference.
-    assert scale.joint_position(np.array([65536, 65536, 0, 0, 0])) == pytest.approx(
-        [0.030, 0, 0, 0, 0]
-    )
+    found = scale.joint_position(np.array([65536, 65536, 0, 0, 0]))
+    assert found == pytest.approx([0.030, 0, 0, 0, 0])
 
 
 @pytest.mark.parametrize("name", ["gantry", "seven-axis", "rx90", "kr270"])
@@ -90,7 +91,8 @@ def test_declaration_and_truth_speak_of_one_robot(name: str) -> None:
     assert spec.gravity_m_s2 == cell.gravity_m_s2
     assert spec.payload is not None
     assert spec.payload.mass_kg == cell.payloads[0].mass_kg
-    declared, plant = (robot_from_urdf(text, spec.gravity_m_s2) for text in (cell.urdf, spec.urdf))
+    texts = (cell.urdf, spec.urdf)
+    declared, plant = (robot_from_urdf(text, spec.gravity_m_s2) for text in texts)
     for one, other in zip(declared.joints, plant.joints, strict=True):
         np.testing.assert_array_equal(one.translation_m, other.translation_m)
         np.testing.assert_array_equal(one.rotation, other.rotation)
@@ -275,6 +277,7 @@ def test_a_picture_says_newton_where_the_joint_slides() -> None:
 
 
 def test_every_kind_of_joint_has_a_unit() -> None:
-    assert {joint_unit(kind).name for kind in JointKind} == {"deg", "mm"}
+    names = {joint_unit(kind).name for kind in JointKind}
+    assert names == {"deg", "mm"}
     assert MILLIMETRE.spell(0.0125) == "12.5 mm"
     assert DEGREE.spell(pi) == "180 deg"

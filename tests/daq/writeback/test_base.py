@@ -21,7 +21,8 @@ from tests.daq.drives import apply_in_drives, entered_gain
 
 
 def _findings(base: str | None, before: bytes, after: bytes) -> list[GateFinding]:
-    request = Request(demo_calibration(), datetime(2025, 1, 2, tzinfo=UTC), base=base)
+    now = datetime(2025, 1, 2, tzinfo=UTC)
+    request = Request(demo_calibration(), now, base=base)
     edit = Edit(subject="x", before=before, after=after)
     context = GateContext(request, edit)
     return list(base_gate(context))

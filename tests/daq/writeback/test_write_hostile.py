@@ -139,7 +139,8 @@ def test_the_link_of_another_user_is_not_followed(controller: Path, tmp_path: Pa
     written = apply(proposal, NOW)
     assert written is not None
     assert written.backup is not None
-    assert (controller.stat().st_uid, written.backup.stat().st_uid) == (4711, 4711)
+    assert controller.stat().st_uid == 4711
+    assert written.backup.stat().st_uid == 4711
 
 
 def test_a_file_of_two_names_is_not_written_under_one_of_them(
@@ -204,7 +205,8 @@ def test_a_deleted_file_comes_back_through_its_link_and_is_recorded(
     actions = [entry.action for entry in entries]
     assert actions[2:] == expected
     assert entries[2].details["sha256_before"] is None
-    assert {entry.subject for entry in entries} == {str(controller)}
+    subjects = {entry.subject for entry in entries}
+    assert subjects == {str(controller)}
 
 
 def test_what_fails_within_a_write_is_recorded_as_failed(
@@ -300,7 +302,8 @@ def test_a_first_write_misses_no_log(
     proposal = propose(target, request)
     apply(proposal, NOW, audit=audit)
     assert caplog.text == ""
-    assert all(BACKUPS_WITHOUT_LOG not in entry.details for entry in read(audit))
+    for entry in read(audit):
+        assert BACKUPS_WITHOUT_LOG not in entry.details
 
 
 def test_history_is_not_called_sound_where_backups_show_that_its_log_is_gone(
