@@ -152,5 +152,5 @@ def test_metrics_are_replaced_whole_and_can_be_read_by_the_collector(tmp_path: P
 
 def test_a_folder_that_is_not_there_is_reported(tmp_path: Path) -> None:
     folder = tmp_path / "none"
-    with pytest.raises(OutputFailed, match="no such file"):
+    with pytest.raises(OutputFailed, match="found no folder"):
         written(Outcome.APPLIED, folder)

@@ -182,7 +182,7 @@ def test_a_damaged_log_leaves_nothing_behind_and_nothing_is_overwritten(
     assert out.read_text() == "mine"
     missing = tmp_path / "absent" / "out.csv"
     assert run_verb("export", "log", log, "--csv", "--out", missing) == ExitCode.UNEXPECTED
-    assert "folder that can be written" in capsys.readouterr().err
+    assert "expected: a folder that is there" in capsys.readouterr().err
 
 
 def test_an_invalid_log_is_exported_and_called_invalid(

@@ -263,7 +263,7 @@ def test_nothing_is_overwritten(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="a file of that name"):
         write(path, content(1), samples([[1]]))
     assert path.read_bytes() == before
-    with pytest.raises(OutputFailed, match="no such file"):
+    with pytest.raises(OutputFailed, match="found no folder"):
         write(tmp_path / "none" / "a.mcap", content(1), samples([[0]]))
 
 
