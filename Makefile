@@ -18,7 +18,7 @@ help:
 	@echo "make demo    set up, then calibrate a simulated six-axis cell end to end into out/demo"
 	@echo "make test    set up, then lint, types, import contracts and tests"
 	@echo "make figaroh  figaroh 1.0.2 in an environment of its own, 1 GB: with it, make test reads exported URDFs with figaroh"
-	@echo "make test-slow  searches, plans and sessions on whole simulated recordings; 15 minutes of processor time"
+	@echo "make test-slow  searches, plans and sessions on whole simulated recordings; 35 minutes of processor time"
 	@echo "make test-processes  whole jobs: jobs that are killed, two buses, real recordings"
 	@echo "make test-vcan  the main job over real SocketCAN (vcan), under User-Mode Linux where this kernel has none"
 	@echo "make chaos    random faults at random moments on SocketCAN for 10 minutes; SEED=1 MINUTES=10 or ROUND=7 (docs/evidence/socketcan.md)"

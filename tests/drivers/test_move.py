@@ -49,6 +49,7 @@ def test_limits_are_kept_and_one_is_used(
         assert np.max(speed_share) == pytest.approx(1.0)
 
 
+@pytest.mark.slow
 @given(distances, limits, limits)
 def test_all_axes_run_from_start_to_end_together(
     distance: tuple[float, ...], velocity: tuple[float, ...], acceleration: tuple[float, ...]

@@ -67,6 +67,7 @@ def test_a_fault_from_the_start_is_refused_by_name_before_anything_moves(kind: F
     assert outcome.restored
 
 
+@pytest.mark.slow
 def test_an_amplifier_without_consumer_heartbeat_is_recorded_and_said_so() -> None:
     outcome = run("no guard", FaultSpec(FaultKind.NO_GUARD, 1))
     assert outcome.error is None

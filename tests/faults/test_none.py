@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pytest
+
 from drivers.messages import EventKind
 from tests.faults.cells import STRIKE, run
 
@@ -19,6 +21,7 @@ INCIDENTS = {
 }
 
 
+@pytest.mark.slow
 def test_a_cell_without_faults_moves_there_and_back_and_gets_its_settings_back() -> None:
     outcome = run("none")
     assert outcome.error is None

@@ -52,6 +52,7 @@ def scenario(folder: Path, faults: str) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_a_fault_of_a_scenario_ends_a_recording_with_exit_code_5_and_is_in_its_log(
     tmp_path: Path,
 ) -> None:

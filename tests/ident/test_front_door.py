@@ -269,6 +269,7 @@ class Frame:
         return np.asarray(self._values, dtype=dtype)
 
 
+@pytest.mark.slow
 def test_data_frames_are_as_good_as_arrays_to_interpreter_and_type_checker(
     example: SimpleNamespace,
 ) -> None:
@@ -455,6 +456,7 @@ def test_an_axis_without_limits_is_not_guessed_to_be_in_degrees(example: SimpleN
     assert [joint.travel for joint in joints] == [6.0, 6.0, 6.0]
 
 
+@pytest.mark.slow
 def test_exchanged_currents_name_the_function_that_tests_their_order(
     example: SimpleNamespace,
 ) -> None:

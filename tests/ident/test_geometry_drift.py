@@ -91,6 +91,7 @@ def _drift(
     return geometry_drift(calibration, model, data, evidence.conditioning, left_nm, use, suspected)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("axis", [1, 2])
 def test_a_lost_zero_is_named_with_its_size(axis: int) -> None:
     position = _new_run().position_rad.copy()
@@ -125,6 +126,7 @@ def test_of_two_zeros_that_explain_the_error_the_one_that_explains_more_is_named
     assert found.placed == expected
 
 
+@pytest.mark.slow
 def test_a_zero_that_is_suspected_needs_not_explain_most_of_the_error() -> None:
     rng = np.random.default_rng(3)
     run = _offset(_new_run(), 1, 2.0)
@@ -194,6 +196,7 @@ def test_nothing_is_named_where_friction_or_a_gain_has_changed() -> None:
     assert _drift(changed_run, truth.model) is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("run", [0, 1], ids=["bare", "loaded"])
 def test_a_run_of_a_closed_chain_is_judged_as_well(run: int) -> None:
     made = recorded(FIVE_BAR, noise_a=0.02)

@@ -74,6 +74,7 @@ def identified(truth: Truth, noisy_runs: tuple[Run, ...]) -> Evidence:
     return gather(found, noisy_runs[:2])
 
 
+@pytest.mark.slow
 def test_the_estimates_own_torque_comes_back(identified: Evidence) -> None:
     assert _largest_difference(identified) < 1e-9
 
@@ -137,6 +138,7 @@ def _without_torque(effect: AcceptedEffect) -> AcceptedEffect:
     return replace(effect, coefficients=coefficients)
 
 
+@pytest.mark.slow
 def test_what_fades_over_a_session_counts_from_its_first_run(
     truth: Truth, noisy_runs: tuple[Run, ...]
 ) -> None:

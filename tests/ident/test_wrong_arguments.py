@@ -477,6 +477,7 @@ def test_runs_of_different_logs_may_have_one_name(
     assert np.array_equal(same.estimate.gains, expected.estimate.gains)
 
 
+@pytest.mark.slow
 def test_a_method_may_be_named(small_truth: Truth, short: tuple[ident.Run, ident.Run]) -> None:
     for method in ident.Method:
         found = ident.identify(small_truth.model, short, ident.Conditioning(), method=method.value)

@@ -73,6 +73,7 @@ def test_the_shards_of_a_study_have_every_task_once(count: int, tasks: int) -> N
     assert largest_difference <= 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("robot", ROBOTS, ids=lambda robot: robot.name)
 def test_a_studied_robot_has_a_weighed_payload_and_a_second_body_that_no_cell_declares(
     robot: StudiedRobot,

@@ -519,6 +519,7 @@ def _shown_base(shown: str) -> str:
     return shown.split("--yes --base ")[1].split(maxsplit=1)[0]
 
 
+@pytest.mark.slow
 def test_the_base_of_a_dry_run_writes_that_change_and_no_other(
     bench: Bench, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -87,6 +87,7 @@ def test_bash_completes_verbs_options_and_names_of_files(shell: Shell, tmp_path:
     shell.type("\x15drivegain report --besi\t", "--beside ")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shell_name", ["bash", "zsh", "fish"])
 def test_each_shell_has_its_script_and_every_verb(shell_name: str, checkout: Path) -> None:
     run = [sys.executable, "-m", "daq"]

@@ -102,6 +102,7 @@ def test_runs_of_a_folder_are_the_valid_ones_of_this_cell(cell: Cell, make_log: 
     assert runs_in(Path(), "saw") == FolderRuns()
 
 
+@pytest.mark.slow
 def test_logs_that_take_long_to_read_are_not_read_for_a_hint(
     cell: Cell,
     made: Plan,

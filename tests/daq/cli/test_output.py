@@ -369,6 +369,7 @@ def test_the_word_of_an_interrupt_before_anything_runs_does_not_block(
 COMMAND = [sys.executable, "-m", "daq", "explain-emcy", "8611h", "--json"]
 
 
+@pytest.mark.slow
 def test_a_reader_that_comes_late_and_is_slow_gets_the_whole_result(
     full_pipe: tuple[int, int], checkout: Path
 ) -> None:
@@ -387,6 +388,7 @@ def test_a_reader_that_comes_late_and_is_slow_gets_the_whole_result(
     assert json.loads(taken.lstrip(b"."))["code"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_result_that_nobody_takes_ends_with_a_signal(
     full_pipe: tuple[int, int], checkout: Path, number: signal.Signals
@@ -403,6 +405,7 @@ def test_a_result_that_nobody_takes_ends_with_a_signal(
         assert process.stderr.read() == "interrupted: the output was not read to its end\n"
 
 
+@pytest.mark.slow
 def test_a_defect_is_printed_and_ends_where_nobody_reads(
     full_pipe: tuple[int, int], checkout: Path
 ) -> None:

@@ -160,6 +160,7 @@ def test_without_its_packages_the_extra_is_named(
     assert not (tmp_path / "made").exists()
 
 
+@pytest.mark.slow
 def test_every_verb_can_be_imported_without_the_simulated_cell() -> None:
     """Their help and what they do to a real cell need no package of the extra."""
     code = (

@@ -76,6 +76,7 @@ def _loaded(code: str, names: tuple[str, ...], checkout: Path) -> list[str]:
     return last_line.split()
 
 
+@pytest.mark.slow
 def test_no_help_waits_for_numerics_or_the_bus(checkout: Path) -> None:
     names = (*NUMERICS, "scipy", "numpy", "can", "canopen", "mcap")
     assert _loaded(HELP, names, checkout) == []

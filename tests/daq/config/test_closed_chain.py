@@ -270,6 +270,7 @@ def test_the_payload_of_a_serial_robot_may_hang_on_any_link_that_moves(tmp_path:
             load_cell(path)
 
 
+@pytest.mark.slow
 def test_places_of_a_cell_are_those_of_its_robot() -> None:
     for name in ("five-bar", "dualv", "orthoglide", "demo"):
         path = CHECKOUT / f"configs/cells/{name}.yaml"

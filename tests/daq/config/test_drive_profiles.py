@@ -537,6 +537,7 @@ def test_torque_and_temperature_are_read_beside_the_samples(
     assert warmth[1, [0, 2, 3, 4, 5]] == pytest.approx(25.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dialect", list(Dialect))
 def test_a_run_is_in_ampere_whatever_the_drive_counts_in(
     dialect: Dialect, checkout: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -561,6 +562,7 @@ def test_a_run_is_in_ampere_whatever_the_drive_counts_in(
     assert len(fits) == 1
 
 
+@pytest.mark.slow
 def test_an_actual_current_is_said_to_be_one(
     checkout: Path,
     tmp_path: Path,

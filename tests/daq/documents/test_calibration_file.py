@@ -64,6 +64,7 @@ def test_a_saved_calibration_is_the_only_file_left(path: Path) -> None:
     assert files == [path]
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(calibrations)
 def test_the_document_is_json_without_nan(calibration: Calibration) -> None:

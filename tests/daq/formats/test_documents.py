@@ -264,6 +264,7 @@ def _dcf_tree(content: bytes) -> object:
     return {section: dict(parser.items(section)) for section in parser.sections()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", list(CASES), ids=lambda kind: kind.value)
 @EXAMPLES
 @given(data=st.data())
@@ -296,6 +297,7 @@ def test_only_the_numbers_meant_change(kind: ControllerFormat, data: st.DataObje
     decode_document(changed.content, "robot", kind).check_against(document, spelling)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "cases", "tree"),
     [
@@ -335,6 +337,7 @@ def test_another_reader_sees_the_new_numbers_and_nothing_else_new(
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", list(CASES), ids=lambda kind: kind.value)
 @EXAMPLES
 @given(data=st.data())

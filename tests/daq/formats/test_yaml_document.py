@@ -50,6 +50,7 @@ def test_only_theNUMBERS_meant_change(case: Case, data: st.DataObject) -> None:
     assert file.with_values({}).text == file.text
 
 
+@pytest.mark.slow
 @settings(max_examples=300, deadline=None)
 @given(
     st.floats(1e-9, 1e9).flatmap(

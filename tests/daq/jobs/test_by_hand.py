@@ -35,6 +35,7 @@ def record_by_hand(rig: Rig, plan: Path, *options: str) -> int:
     return main(["record", str(rig.cell_file), str(plan), "--out", str(out), "--json", *options])
 
 
+@pytest.mark.slow
 def test_the_policy_for_jobs_moves_no_axis_for_a_person(
     tmp_path: Path, one_move: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -50,6 +51,7 @@ def test_the_policy_for_jobs_moves_no_axis_for_a_person(
     assert not list(rig.folder.glob("*.mcap*"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("motion", ["ask", "allowed"])
 def test_an_interlock_that_says_no_holds_a_person_too(
     tmp_path: Path, one_move: Path, motion: str, capsys: pytest.CaptureFixture[str]

@@ -66,6 +66,7 @@ def held(rig: Rig, kind: type[Exception], code: int) -> Exception:
     return caught.value
 
 
+@pytest.mark.slow
 def test_an_interlock_that_says_no_lets_nothing_begin(tmp_path: Path, made: Made) -> None:
     folder = tmp_path / "cell"
     rig = made_rig(folder, made)
@@ -144,6 +145,7 @@ def test_an_interlock_that_opens_between_two_runs_ends_the_job_there(
     assert moved_s < 10.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("warm_up_min", [0, 0.05], ids=["run", "warm-up"])
 def test_a_door_that_opens_while_the_drives_are_prepared_keeps_them_without_power(
     tmp_path: Path, one_move: Path, warm_up_min: float
@@ -178,6 +180,7 @@ def test_a_door_that_opens_while_the_drives_are_prepared_keeps_them_without_powe
     assert not list(files)
 
 
+@pytest.mark.slow
 def test_a_payload_that_cannot_be_mounted_ends_the_job_and_the_next_goes_on_with_it(
     tmp_path: Path, made: Made
 ) -> None:
@@ -365,6 +368,7 @@ def test_a_hub_known_by_a_mapped_address_alone_is_that_of_its_ipv4_address(
     assert lock_name(hub) == lock_name(replace(hub, host="10.0.0.7"))
 
 
+@pytest.mark.slow
 def test_a_job_that_is_out_of_time_stops_the_axes(tmp_path: Path, one_move: Path) -> None:
     folder = tmp_path / "cell"
     rig = make_rig(folder, one_move)
@@ -400,6 +404,7 @@ def test_an_alarm_does_not_cut_a_stop_short() -> None:
     assert signal.getsignal(signal.SIGALRM) is signal.SIG_DFL
 
 
+@pytest.mark.slow
 def test_a_service_manager_that_ends_the_job_ends_the_motion(
     tmp_path: Path, one_move: Path
 ) -> None:
@@ -494,6 +499,7 @@ def test_a_job_under_a_later_date_does_not_hold_the_next_ones(
     assert len(rig.sessions) == 3
 
 
+@pytest.mark.slow
 def test_an_unfinished_session_under_a_later_date_is_not_continued(
     tmp_path: Path, made: Made
 ) -> None:
@@ -511,6 +517,7 @@ def test_an_unfinished_session_under_a_later_date_is_not_continued(
     assert wrong.folder.is_dir()
 
 
+@pytest.mark.slow
 def test_a_clock_that_went_back_is_said_and_the_next_session_is_one_of_its_own(
     tmp_path: Path, made: Made
 ) -> None:
@@ -725,6 +732,7 @@ def test_a_dry_run_asks_and_writes_nothing(tmp_path: Path, made: Made) -> None:
         preview(rig.cell_file, rig.cell, rig.tools, journal, who="a person", lock_folder=rig.folder)
 
 
+@pytest.mark.slow
 def test_a_warm_up_is_made_of_the_plans_moves_and_asks_the_interlock_too(
     tmp_path: Path, made: Made
 ) -> None:

@@ -82,6 +82,7 @@ def test_a_whole_job_applies_what_it_found_and_leaves_everything_that_records_it
     assert levels <= {"info", "notice", "warning"}
 
 
+@pytest.mark.slow
 def test_the_rollback_and_its_rollback_to_what_a_job_wrote_is_known(
     tmp_path: Path, made: Made
 ) -> None:

@@ -165,6 +165,7 @@ def test_a_state_with_a_count_that_is_none_is_no_session(
     assert sessions(tmp_path) == ()
 
 
+@pytest.mark.slow
 def test_a_calibration_of_other_logs_is_none_of_the_session(tmp_path: Path, made: Made) -> None:
     folder = tmp_path / "cell"
     rig = made_rig(folder, made)
@@ -203,6 +204,7 @@ def test_any_time_in_a_state_is_judged_without_a_crash(began: datetime, later_s:
     assert counted == (() if began > at + CLOCK_SLACK else (session,))
 
 
+@pytest.mark.slow
 def test_a_session_of_the_far_future_is_reported_and_does_not_end_all_calibrations(
     tmp_path: Path, made: Made
 ) -> None:

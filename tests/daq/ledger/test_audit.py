@@ -127,6 +127,7 @@ def test_the_digest_is_sha256_of_canonical_json_and_covers_the_one_before(tmp_pa
     assert first.previous == "0" * 64
 
 
+@pytest.mark.slow
 @given(line=st.integers(0, 5), data=st.data())
 def test_one_changed_byte_is_found_at_its_line(line: int, data: st.DataObject) -> None:
     with _folder() as folder:
@@ -158,6 +159,7 @@ def test_removed_lines_are_found_where_they_were(line: int, count: int) -> None:
     assert line_text in verdict.flaws[0].says
 
 
+@pytest.mark.slow
 @given(st.permutations(range(6)))
 def test_a_changed_order_is_found(order: list[int]) -> None:
     with _folder() as folder:
@@ -218,6 +220,7 @@ def test_a_cut_off_tail_is_found_by_who_noted_an_entry_elsewhere(tmp_path: Path)
     assert broken == 1
 
 
+@pytest.mark.slow
 @given(st.lists(st.floats(0, 1), min_size=1, max_size=4), st.data())
 def test_what_killed_writers_leave_stays_and_is_reported(
     cuts: list[float], data: st.DataObject

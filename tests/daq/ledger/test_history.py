@@ -171,6 +171,7 @@ def test_a_calibration_is_entered_by_hand(
     assert len(points) == 1
 
 
+@pytest.mark.slow
 def test_a_drift_is_reported_with_its_time_its_size_and_a_question(
     cell_file: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -226,6 +227,7 @@ def test_a_drift_from_the_first_day_is_reported_as_steady(
     assert b"steady change" in picture.read_bytes()
 
 
+@pytest.mark.slow
 def test_an_alarm_that_has_passed_has_no_date(
     cell_file: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -245,6 +247,7 @@ def test_an_alarm_that_has_passed_has_no_date(
     assert axis["baseline"] == pytest.approx(mean_known)
 
 
+@pytest.mark.slow
 def test_without_a_drift_there_is_no_alarm(
     cell_file: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -591,6 +594,7 @@ def test_an_explanation_without_its_parts_is_refused(cell_file: Path, arguments:
     assert len(read(path)) == 3
 
 
+@pytest.mark.slow
 def test_the_table_leaves_as_csv(cell_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
     _filled(cell_file, 15, drifting)
     out = cell_file.parent / "history.csv"

@@ -463,6 +463,7 @@ def test_a_calibration_that_cannot_be_read_is_a_finding(
     assert "calibration 111111111111… of entry 3: its figures are not those" in said
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("damage", ["edited", "first removed", "end cut off", "deleted"])
 def test_a_damaged_log_is_reported_by_each_command_that_reads_or_adds_to_it(
     cell_file: Path, damage: str, caplog: pytest.LogCaptureFixture

@@ -53,6 +53,7 @@ def _numbers(column: Sequence[str]) -> np.ndarray[Any, np.dtype[np.float64]]:
     return np.array([float(text) for text in column])
 
 
+@pytest.mark.slow
 def test_csv_has_the_numbers_that_a_fit_gets(
     log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -91,6 +92,7 @@ def test_csv_has_the_numbers_that_a_fit_gets(
     assert list(tmp_path.iterdir()) == [out]
 
 
+@pytest.mark.slow
 def test_a_counter_that_wraps_goes_on_from_block_to_block(tmp_path: Path, checkout: Path) -> None:
     step = 2**20
     true = [step * row for row in range(ROWS)]
@@ -107,6 +109,7 @@ def test_a_counter_that_wraps_goes_on_from_block_to_block(tmp_path: Path, checko
     assert [int(text) for text in j4_motor_counts] == true
 
 
+@pytest.mark.slow
 def test_torques_and_temperatures_are_in_the_row_of_their_sync(
     tmp_path: Path, checkout: Path
 ) -> None:
@@ -136,6 +139,7 @@ def test_torques_and_temperatures_are_in_the_row_of_their_sync(
     assert found == expected
 
 
+@pytest.mark.slow
 def test_parquet_has_the_same_columns(log: Path, tmp_path: Path) -> None:
     pytest.importorskip("pyarrow", reason="the optional extra `parquet`")
     parquet: Any = importlib.import_module("pyarrow.parquet")

@@ -1433,6 +1433,7 @@ def test_a_log_that_cannot_be_written_leaves_no_held_out_part(bench: Bench) -> N
     assert bench.left == ["run.mcap"]
 
 
+@pytest.mark.slow
 def test_the_real_ur10_is_split_by_its_description(shared_data: Path, tmp_path: Path) -> None:
     """A ROS 2 bag in SQLite; the two logs are the parts that the studies read past the import."""
     bag = "ur10_exciting_trajectory.db3"

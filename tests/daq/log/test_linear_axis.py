@@ -76,6 +76,7 @@ def _import(folder: Path, unit: str) -> int:
     )
 
 
+@pytest.mark.slow
 def test_metres_and_millimetres_are_the_same_run(slide: Path) -> None:
     assert _import(slide, "m") == _import(slide, "mm") == ExitCode.OK
     path = slide / "m.mcap"

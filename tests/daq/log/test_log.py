@@ -72,6 +72,7 @@ READINGS = st.lists(
 )
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=20)
 @given(_recordings(), READINGS)
 def test_slow_readings_come_back_and_leave_the_samples_alone(

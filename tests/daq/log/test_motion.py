@@ -167,6 +167,7 @@ SMALL_GLITCH_RAD = 0.002
 """Less than J2 may move within a sample by its velocity limit, 3.5 mrad."""
 
 
+@pytest.mark.slow
 def test_a_glitch_that_no_limit_rules_out_is_filled_in_and_the_log_valid(tmp_path: Path) -> None:
     joint_rad = _joints()
     sound_path = tmp_path / "sound.mcap"
@@ -211,6 +212,7 @@ def _slipped(joint_rad: FloatArray, current: NDArray[np.int64]) -> None:
 FAULTS = {"frozen": _frozen, "without its sign": _without_sign, "slipped": _slipped}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", FAULTS)
 def test_a_log_that_a_fit_refuses_is_called_invalid_by_all(kind: str, tmp_path: Path) -> None:
     """None of these has a step that is too fast for the robot."""

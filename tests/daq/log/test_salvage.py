@@ -137,6 +137,7 @@ def test_at_most_the_last_150_ms_are_not_on_disk_when_a_recorder_is_killed(
                 assert _same(read_log(saved.log).samples, saved.statistics.samples)
 
 
+@pytest.mark.slow
 def test_a_process_that_is_killed_loses_no_more(tmp_path: Path, checkout: Path) -> None:
     """The promise itself: SIGKILL, from the process's own hand so that what it had written is
     known.

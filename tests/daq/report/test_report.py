@@ -55,6 +55,7 @@ def _drawings(kind: str) -> tuple[str, ...]:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "panels"), [("torque", 6), ("residual", 4)])
 def test_a_file_of_drawings_is_whole_and_the_same_twice(kind: str, panels: int) -> None:
     drawn = sheet(_drawings(kind), "J3 <&> run")

@@ -741,6 +741,7 @@ def test_the_report_has_every_sentence_and_number_of_the_verbose_output(closed: 
     assert set(short) <= {part.text for part in parts if isinstance(part, Sentence)}
 
 
+@pytest.mark.slow
 def test_the_dependence_on_the_mass_is_in_the_documents_and_in_a_sentence(
     closed: Closed, tmp_path: Path
 ) -> None:

@@ -50,6 +50,7 @@ def _digits(text: str) -> list[str]:
     return re.findall(r"\d[\d.]*", text)
 
 
+@pytest.mark.slow
 @given(
     st.lists(
         st.lists(st.floats(0, 1e15).map("{:.9g} ± 0.123456".format), min_size=7, max_size=7),

@@ -115,6 +115,7 @@ def _export(*arguments: str | Path) -> int:
     return main(["export", "urdf", *map(str, arguments)])
 
 
+@pytest.mark.slow
 def test_pinocchio_with_the_exported_urdf_gives_the_identified_torque(
     tx40: tuple[Path, Path, FloatArray], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -134,6 +135,7 @@ def test_pinocchio_with_the_exported_urdf_gives_the_identified_torque(
     _compare(model, out.read_text(), drive, standard)
 
 
+@pytest.mark.slow
 def test_a_corrected_description_is_said_beside_the_bodies(
     tx40: tuple[Path, Path, FloatArray], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -211,6 +213,7 @@ def _compare(model: Model, urdf: str, drive: FloatArray, standard: FloatArray) -
     assert rigid_norm <= 2e-6 * expected_norm
 
 
+@pytest.mark.slow
 def test_an_impossible_calibration_is_projected_and_reported(
     tx40: tuple[Path, Path, FloatArray], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -274,6 +277,7 @@ def test_of_a_closed_chain_the_tree_is_written_and_its_closures_are_named(
     assert len(urdf_links(out.read_text())) == joint_count
 
 
+@pytest.mark.slow
 def test_no_input_and_no_foreign_file_is_overwritten(
     tx40: tuple[Path, Path, FloatArray], tmp_path: Path, checkout: Path
 ) -> None:
@@ -321,6 +325,7 @@ def test_without_the_solver_the_extra_is_named(
     assert not (tmp_path / "robot.urdf").exists()
 
 
+@pytest.mark.slow
 def test_nothing_brings_the_solver_along_at_start_up() -> None:
     code = (
         "import sys, daq.cli.app, daq.cli.logs, ident.physical.physical;print({'cvxpy', "
@@ -534,6 +539,7 @@ def _with_friction_of_a_package(calibration: Calibration, axis: str) -> Calibrat
     return replace(calibration, parameters=parameters, effects=effects)
 
 
+@pytest.mark.slow
 def test_bodies_are_the_same_where_the_package_of_an_effect_is_not_installed(
     tx40: tuple[Path, Path, FloatArray],
     tmp_path: Path,

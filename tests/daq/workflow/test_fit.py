@@ -187,6 +187,7 @@ def test_a_sigma_of_few_moves_is_said_to_be_rough(
     assert [*sigma_notes(found)] == []
 
 
+@pytest.mark.slow
 def test_an_axis_that_did_not_move_has_a_dash_and_no_number(
     shelf: Shelf, pair: Fit, monkeypatch: pytest.MonkeyPatch
 ) -> None:

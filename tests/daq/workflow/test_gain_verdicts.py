@@ -60,6 +60,7 @@ def test_the_deviations_are_the_fits_own_and_weak_gains_get_advice(fitted: Fit) 
         assert gain.advice.std_percent < gain.std_percent
 
 
+@pytest.mark.slow
 def test_gravity_does_not_act_on_the_vertical_axis(fitted: Fit) -> None:
     found = gain_verdicts(fitted)
     expected = [False, True, True, True, True, True]

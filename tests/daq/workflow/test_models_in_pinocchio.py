@@ -96,6 +96,7 @@ def test_the_urdf_has_the_predicted_torque_without_what_is_listed(
     assert difference <= SAME
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["tx40", "kr270", "seven-axis", "ur10"])
 def test_the_mjcf_of_a_serial_robot_has_the_same_bodies_and_joints(
     name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -200,6 +200,7 @@ def test_a_part_that_only_turns_at_one_height_leaves_room_for_later_moves() -> N
     assert len(later.moves) >= 5
 
 
+@pytest.mark.slow
 def test_a_declared_workspace_is_the_room_without_a_second_one(
     experiment: Experiment, accepted: tuple[Plan, ...]
 ) -> None:

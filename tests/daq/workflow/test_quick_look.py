@@ -133,6 +133,7 @@ def test_there_are_no_figures_before_both_kinds_of_block_and_half_a_minute(
     assert short.look(PLACE, {}).motion_s == 29.0
 
 
+@pytest.mark.slow
 def test_after_a_move_each_gain_is_beside_its_target_with_the_worst_first(
     nothing: GainsSoFar, blocks: tuple[Run, ...]
 ) -> None:
@@ -193,6 +194,7 @@ def test_sigma_goes_on_from_that_of_the_estimator(
     assert nothing.in_proportion(judged).scale is None
 
 
+@pytest.mark.slow
 def test_sigma_falls_while_a_block_grows(nothing: GainsSoFar, blocks: tuple[Run, ...]) -> None:
     bare, loaded, again = blocks
     known = nothing.with_run(bare).with_motion(bare).with_run(loaded).with_motion(loaded)

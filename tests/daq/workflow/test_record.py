@@ -143,6 +143,7 @@ def test_no_full_collection_delays_a_sync(timed: Rig) -> None:
     assert gc.get_threshold() == usual
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pacing", ["lockstep", "timed"])
 def test_a_sound_run_is_valid_and_starts_at_wall_time(
     pacing: str, checkout: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -159,6 +160,7 @@ def test_a_sound_run_is_valid_and_starts_at_wall_time(
     assert move is not None
 
 
+@pytest.mark.slow
 def test_a_glitch_of_an_encoder_makes_the_run_invalid(lockstep: Rig) -> None:
     """One answer of the elbow, in the middle of the run, has a position that is 0.9 rad away."""
     sound = lockstep.run()
@@ -202,6 +204,7 @@ def test_what_is_done_before_the_first_sample_costs_no_period(
     assert set(time_steps_ns) == {PERIOD_NS}
 
 
+@pytest.mark.slow
 def test_moves_are_planned_from_where_the_axes_are_known_to_be(
     lockstep: Rig, checkout: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -284,6 +287,7 @@ def test_another_node_on_the_bus_does_no_harm(lockstep: Rig) -> None:
     assert (done.log.valid, done.log.reason) == (True, "")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "step_ns", [0, 3 * SECOND_NS, 3 * DAY_NS, -3 * DAY_NS, 730 * DAY_NS, -730 * DAY_NS]
 )

@@ -57,6 +57,7 @@ def test_an_axis_beyond_its_limit_is_a_persons_business(outside: Rig) -> None:
     assert "`policy: {recovery_motion: allowed}`" in failure.do
 
 
+@pytest.mark.slow
 def test_where_the_cell_allows_it_the_axis_goes_slowly_back_and_the_run_begins(
     outside: Rig,
 ) -> None:

@@ -64,6 +64,7 @@ def test_a_real_log_as_a_table(
     assert counted == validated["rows"]
 
 
+@pytest.mark.slow
 def test_its_currents_are_those_that_a_drive_would_get(
     real: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

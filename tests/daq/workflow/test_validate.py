@@ -28,6 +28,7 @@ from tests.daq.calibrations import demo_calibration
 from tests.daq.logs import demo_content, samples, write
 
 
+@pytest.mark.slow
 def test_the_file_gives_the_errors_of_the_fit(
     real: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -76,6 +77,7 @@ def test_text_and_picture(
     assert "expected: a folder" in error
 
 
+@pytest.mark.slow
 def test_identified_gains_that_apply_refuses_are_not_applied_next(
     real: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -120,6 +122,7 @@ def test_the_next_step_names_the_cell_file_that_the_logs_carry(
     assert cell_of(fitted, logs) == Path("CELL")
 
 
+@pytest.mark.slow
 def test_what_a_calibration_has_met_and_what_it_was_made_with(real: tuple[Path, Path]) -> None:
     file, log = real
     calibration = load_calibration(file)
@@ -138,6 +141,7 @@ def test_what_a_calibration_has_met_and_what_it_was_made_with(real: tuple[Path, 
     assert together((new, new)).total == pytest.approx(new.error.total)
 
 
+@pytest.mark.slow
 def test_a_wrong_gain_shows_on_its_axis_alone(real: tuple[Path, Path]) -> None:
     file, log = real
     calibration = load_calibration(file)
@@ -152,6 +156,7 @@ def test_a_wrong_gain_shows_on_its_axis_alone(real: tuple[Path, Path]) -> None:
     assert wrong.error.axes[1:] == pytest.approx(right.error.axes[1:])
 
 
+@pytest.mark.slow
 def test_the_filter_is_that_of_the_calibration(real: tuple[Path, Path]) -> None:
     file, log = real
     calibration = load_calibration(file)
@@ -194,6 +199,7 @@ def _calibrated(calibration: Calibration, tmp_path: Path) -> list[str]:
     return ["validate", str(tmp_path / "calibration.yaml")]
 
 
+@pytest.mark.slow
 def test_refusals_have_their_exit_codes(
     complete: Calibration, checkout: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

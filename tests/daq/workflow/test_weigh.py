@@ -128,6 +128,7 @@ def test_a_calibration_comes_first_or_as_an_option(
         assert printed[0] == printed[1] == printed[2]
 
 
+@pytest.mark.slow
 def test_a_log_that_declares_a_payload_is_not_bare(
     real: tuple[Path, Path], checkout: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

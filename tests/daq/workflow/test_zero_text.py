@@ -42,6 +42,7 @@ def _by_encoders(value_rad: float) -> GeometryFinding:
     return GeometryFinding(4e-4, 6e-6, 5e-6, True, (correction,), covariance, (), (), ())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("too_large_deg", DECLARED_TOO_LARGE_DEG)
 def test_a_zero_has_one_sign_by_torque_by_encoders_and_on_the_certificate(
     checkout: Path, too_large_deg: float

@@ -183,6 +183,7 @@ def test_a_changed_letter_of_a_signature_is_noticed_or_means_nothing(
     assert read == minisign.parse_signature(SIGNATURE)
 
 
+@pytest.mark.slow
 @settings(max_examples=200, deadline=None)
 @given(
     st.text(max_size=300) | st.binary(max_size=200).map(lambda raw: base64.b64encode(raw).decode())

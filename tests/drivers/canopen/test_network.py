@@ -139,6 +139,7 @@ def test_an_axis_that_someone_enabled_is_without_power_afterwards() -> None:
     assert statusword & 0x6F == 0x40
 
 
+@pytest.mark.slow
 def test_an_axis_that_stays_in_quick_stop_is_without_power_afterwards() -> None:
     network, bus = cell(1)
     bus.nodes[0].quick_stop_stays = True

@@ -43,6 +43,7 @@ def test_every_node_is_reported_whatever_one_of_them_does(answer: Answer, proble
     assert bus.clock.now_ns - begun_ns < 5_000_000_000
 
 
+@pytest.mark.slow
 def test_a_scan_of_many_nodes_that_do_not_end_ends() -> None:
     network, bus = cell(40)
     bus.nodes = tuple(Hostile(node.node_id, bus, silent) for node in bus.nodes)

@@ -425,11 +425,13 @@ def test_an_encoder_that_flickers_stands_still(moving: Moving) -> None:
     assert powerless(moving[2])
 
 
+@pytest.mark.slow
 def test_an_axis_that_creeps_does_not_stand_still(moving: Moving) -> None:
     bound_cycles = round(BOUNDS.stop_s * 1e9 / PERIOD_NS)
     assert len(stop_with(moving, (7.0,))) >= bound_cycles
 
 
+@pytest.mark.slow
 def test_every_axis_that_could_not_be_stopped_is_reported(
     moving: Moving, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -621,6 +623,7 @@ def test_amplifiers_that_were_not_seen_to_stop_go_on_watching_us(
     bus.on_cycle = lambda _cycle: None
 
 
+@pytest.mark.slow
 def test_what_is_stopped_by_sdo_is_reported_before_one_is_waited_for(
     moving: Moving, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -646,6 +649,7 @@ def test_what_is_stopped_by_sdo_is_reported_before_one_is_waited_for(
     assert powerless(bus)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "error", [BusError("bus B", "bus-off"), NodeMisplaced(9, "A", "B")], ids=["bus", "misplaced"]
 )

@@ -47,6 +47,7 @@ def begin_move(
     master.control(SIX, 0x1F)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("payload", [None, "disc"])
 @pytest.mark.parametrize(
     "effects", [(), (UndeclaredEffect("load-friction", 2, {"coefficient": 0.12}),)]

@@ -140,6 +140,7 @@ def test_scan_prepare_move_and_give_back(address: BusAddress, axes: tuple[Axis, 
         assert settings(network) == before
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("cell")
 def test_a_closed_run_leaves_no_axis_with_power(
     address: BusAddress, axes: tuple[Axis, ...]

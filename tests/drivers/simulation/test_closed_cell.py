@@ -79,6 +79,7 @@ def test_moves_are_reached_and_the_loops_stay_closed(
         assert largest_error < 1e-11
 
 
+@pytest.mark.slow
 def test_redundant_drives_preload_the_platform_while_their_trapezoids_disagree() -> None:
     """The currents have a part that moves nothing; it passes when the drives agree again."""
     spec = cell("dualv")

@@ -389,6 +389,7 @@ def test_energy_drift_vanishes_with_the_step(name: str) -> None:
     assert coarse / fine == pytest.approx(4.0, rel=0.3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ROBOTS)
 def test_closures_hold_in_a_long_run_and_friction_only_takes_energy(name: str) -> None:
     spec = cell(name)

@@ -491,6 +491,7 @@ def test_a_drive_too_stiff_for_the_step_is_refused() -> None:
         Plant(clean_cell(effects=(effect,)))
 
 
+@pytest.mark.slow
 @settings(max_examples=30, deadline=None, derandomize=True)
 @given(axis=st.integers(3, 5), stiffness=st.floats(10.0, 1e5), damping=st.floats(0.0, 10.0))
 def test_a_drive_that_is_not_refused_comes_to_rest(

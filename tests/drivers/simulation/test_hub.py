@@ -89,6 +89,7 @@ def test_a_cell_that_reads_late_keeps_little_waiting_for_it() -> None:
         cell.shutdown()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("line", [b"< send 12345 8 01 >", b"< echo >", b"< nonsense >", b"<>"])
 def test_a_deaf_client_that_is_answered_holds_up_nobody_and_fills_no_output(
     line: bytes, caplog: pytest.LogCaptureFixture

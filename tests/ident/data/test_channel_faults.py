@@ -111,6 +111,7 @@ def test_what_only_looks_odd_is_no_fault(kind: str) -> None:
 # Glitches
 
 
+@pytest.mark.slow
 @given(
     start=st.integers(0, 5990),
     samples=st.integers(1, 3),

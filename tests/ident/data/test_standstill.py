@@ -102,6 +102,7 @@ def test_gains_are_as_good_as_with_declared_speeds(truth: Truth, sticking: tuple
     assert _gain_error(truth, sticking, DERIVED) < 1.3 * _gain_error(truth, sticking, CONDITIONING)
 
 
+@pytest.mark.slow
 def test_without_current_noise_only_standstill_biases_the_gains(
     truth: Truth, clean_runs: tuple[Run, ...]
 ) -> None:

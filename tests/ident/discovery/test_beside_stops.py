@@ -53,6 +53,7 @@ def _refuted(small: Evidence, truth: Truth, torque_nm: FloatArray) -> str:
     return refuted_clear_of_stops(joined, PLACED)
 
 
+@pytest.mark.slow
 def test_presliding_that_acts_in_all_rows_joins(small: Evidence, small_truth: Truth) -> None:
     assert not _refuted(small, small_truth, _torque_of_presliding(small))
 

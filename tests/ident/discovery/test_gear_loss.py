@@ -88,6 +88,7 @@ def test_the_shares_are_those_of_the_true_load(small: Evidence, small_truth: Tru
     assert driving_shares(small.training, small.estimate)[AXIS] == pytest.approx(expected, abs=0.01)
 
 
+@pytest.mark.slow
 def test_the_contrast_of_both_sides_shows_the_loss_and_its_law_the_gain(
     lossy: Evidence, small_truth: Truth
 ) -> None:

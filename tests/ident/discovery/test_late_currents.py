@@ -66,6 +66,7 @@ def test_currents_that_are_not_late_are_not_named() -> None:
         assert abs(found.seconds[0]) < 3e-4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("delays_ms", "effects"),
     [
@@ -102,6 +103,7 @@ def test_one_current_that_is_left_to_test_is_no_common_delay() -> None:
     assert found is None or PlacedEffect(TimeSkew(), 0) not in found.effects
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("delay_ms", [8.0, -8.0])
 def test_a_long_delay_has_its_size_in_the_fit(delay_ms: float) -> None:
     """Without its filter, jumps of the torque shorten it."""

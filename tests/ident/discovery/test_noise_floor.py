@@ -209,6 +209,7 @@ def test_an_axis_that_rests_throughout_a_run_counts_as_many_dwells(
         assert floor.noise_a == pytest.approx(expected, rel=DEVIATIONS * floor.std_percent / 100.0)
 
 
+@pytest.mark.slow
 @settings(max_examples=20, deadline=None)
 @given(factor=st.floats(0.01, 100.0), offset=st.floats(-10.0, 10.0))
 def test_it_has_the_unit_of_the_current_and_no_offset(

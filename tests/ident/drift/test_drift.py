@@ -458,6 +458,7 @@ def test_no_alarm_in_24_recalibrations_without_drift() -> None:
     assert RECALIBRATIONS == 24
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("std_percent", "within_two", "within_four"),
     [(0.2, 98, 99), (0.3, 93, 99), (0.5, 85, 98), (0.8, 91, 97), (1, 86, 94)],

@@ -26,6 +26,7 @@ def _t(values: NDArray[np.float64], stds: NDArray[np.float64]) -> float:
     return float(slope / covariance_root)
 
 
+@pytest.mark.slow
 @settings(max_examples=100, deadline=None)
 @given(_points)
 def test_each_line_is_that_of_numpy(points: list[tuple[float, float]]) -> None:

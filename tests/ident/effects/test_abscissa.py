@@ -75,6 +75,7 @@ def test_the_way_grows_until_the_motion_turns(velocity: FloatArray) -> None:
     assert np.all(direction[np.argmax(moving) :] != 0.0) or not moving.any()
 
 
+@pytest.mark.slow
 @given(velocity=_speeds)
 @settings(deadline=None)
 def test_the_way_is_the_same_in_the_other_direction(velocity: FloatArray) -> None:

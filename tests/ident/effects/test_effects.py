@@ -374,6 +374,7 @@ def _duplicates(families: tuple[tuple[Effect, ...], ...]) -> list[tuple[str, str
     return pairs
 
 
+@pytest.mark.slow
 def test_no_two_effects_are_the_same_under_two_names() -> None:
     of_one_joint = [("spring ()", f"cable ({other})") for other in PAIRED]
     forms = [("saturation (0)", "saturation (1)")]  # with one term and with two

@@ -221,6 +221,7 @@ def test_effects_of_one_name_are_one_family() -> None:
     assert search_families() == EFFECTS
 
 
+@pytest.mark.slow
 def test_an_effect_of_no_package_is_named_by_its_module() -> None:
     assert package_of(SquareDrag()) == f"module {__name__}"
     effect = EFFECTS[0][0]
@@ -367,6 +368,7 @@ def test_an_entry_point_may_name_one_effect(site: Site) -> None:
     assert len(family) == 1
 
 
+@pytest.mark.slow
 def test_an_argument_takes_the_place_of_an_installed_effect(site: Site) -> None:
     site.install("drag-argued", _code("drag-argued"))
     own = SquareDrag(1.5)

@@ -35,6 +35,7 @@ def whole(truth: Truth, noisy_runs: tuple[Run, ...]) -> System:
     return regrouped(standard)
 
 
+@pytest.mark.slow
 def test_the_triangles_are_those_of_the_rows(noisy: Evidence, whole: System) -> None:
     rows = noisy.training.system()
     for one, other in ((whole.joints, rows.joints), (whole.motors, rows.motors)):
@@ -84,6 +85,7 @@ def test_results_do_not_depend_on_the_chunk(
     assert other.gains_std == pytest.approx(small_estimate.gains_std, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_many_moves_are_joined_and_say_the_same(
     truth: Truth, noisy_runs: tuple[Run, ...], whole: System, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -75,6 +75,7 @@ def test_gains_hardly_change_and_the_error_hardly_grows(system: System) -> None:
     assert before <= after < 1.05 * before
 
 
+@pytest.mark.slow
 def test_the_whole_estimate_holds_zeros_and_predicts_the_same(system: System) -> None:
     found = essential(system, tls, 20.0)
     removed = {step.name for step in found.removed}

@@ -27,6 +27,7 @@ def _fit(truth: Truth, runs: tuple[Run, ...]) -> Estimate:
     return identify(truth.model, runs, CONDITIONING).estimate
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", Method)
 def test_without_noise_every_method_finds_every_gain(
     truth: Truth, clean_runs: tuple[Run, ...], method: Method
@@ -61,6 +62,7 @@ def test_ml_and_the_papers_tls_beat_wls(noisy_found: Identification) -> None:
     assert errors[Method.WLS] > 0.1
 
 
+@pytest.mark.slow
 def test_gains_scale_with_the_payload_mass(
     truth: Truth, noisy_runs: tuple[Run, ...], noisy_found: Identification
 ) -> None:
@@ -70,6 +72,7 @@ def test_gains_scale_with_the_payload_mass(
     assert _fit(truth, runs).gains == pytest.approx(1.05 * noisy_found.estimate.gains, rel=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("factor", [1000.0, 2.0**-0.5, -1.0])
 def test_a_change_of_current_unit_scales_exactly_that_gain(
     truth: Truth, noisy_runs: tuple[Run, ...], noisy_found: Identification, factor: float
@@ -84,6 +87,7 @@ def test_a_change_of_current_unit_scales_exactly_that_gain(
     assert after.gains_std == pytest.approx(before.gains_std / np.abs(scale), rel=1e-4)
 
 
+@pytest.mark.slow
 def test_the_order_of_runs_does_not_matter(
     truth: Truth, noisy_runs: tuple[Run, ...], noisy_found: Identification
 ) -> None:

@@ -103,6 +103,7 @@ def test_what_the_payload_adds_to_friction_is_that_of_the_truth(
         assert parameter_difference < 4.0 * found.estimate.parameters_std[index]
 
 
+@pytest.mark.slow
 def test_it_costs_little_where_friction_stays(truth: Truth) -> None:
     rng = np.random.default_rng(8)
     runs = [

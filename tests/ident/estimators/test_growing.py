@@ -222,6 +222,7 @@ def test_a_redundant_robot_grows_too() -> None:
 # What is not known yet
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=8)
 @given(chosen=st.sets(st.sampled_from((0, 3, 4, 7)), min_size=1))
 def test_without_a_payload_the_gains_are_unknown_however_much_is_recorded(

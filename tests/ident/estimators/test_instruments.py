@@ -36,6 +36,7 @@ def disturbed(small_truth: Truth) -> tuple[Identification, ...]:
     return tuple(identify(small_truth.model, runs, THREE, method=method) for method in ("ml", "iv"))
 
 
+@pytest.mark.slow
 def test_iv_solves_the_equations_of_its_instruments(disturbed: tuple[Identification, ...]) -> None:
     """Σ_i (T L̂_i)ᵀ e_i γ_i/σ_i² = 0 and v̂_iᵀ e_i = 0 with the residual of the recorded motion."""
     found = disturbed[1]
@@ -94,6 +95,7 @@ def test_the_loop_bends_ml_and_not_iv(small_truth: Truth) -> None:
     assert np.all(np.abs(mean["iv"]) < 3.0 * noise)
 
 
+@pytest.mark.slow
 def test_instruments_of_rows_are_those_of_the_reduction(small_truth: Truth) -> None:
     """The search builds its rows whole, the fit as triangles:
     both give the same estimate, with and without effects.

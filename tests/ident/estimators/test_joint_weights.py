@@ -118,6 +118,7 @@ def test_joint_data_std_without_rows_is_infinite_so_that_the_joint_has_no_weight
     assert np.isfinite(found[1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("axis", range(3))
 def test_joint_data_std_follows_the_noise_of_the_current_and_not_the_gain(
     small_truth: Truth, axis: int
@@ -186,6 +187,7 @@ def test_a_wrist_has_no_torque_of_the_known_mass_so_free_gains_take_the_global_e
     assert gains == pytest.approx(expected[:6], rel=1e-6)
 
 
+@pytest.mark.slow
 def test_tls_of_runs_in_another_order_is_the_same(
     truth: Truth, noisy_runs: tuple[Run, ...]
 ) -> None:

@@ -32,6 +32,7 @@ def undeclared(truth: Truth) -> tuple[Run, ...]:
     return tuple(replace(run, payload=None) for run in runs)
 
 
+@pytest.mark.slow
 def test_mounted_in_every_run_but_declared_absent(
     truth: Truth, noisy_runs: tuple[Run, ...], undeclared: tuple[Run, ...]
 ) -> None:
@@ -41,6 +42,7 @@ def test_mounted_in_every_run_but_declared_absent(
     assert min(caught.value.std_percent) > 50.0
 
 
+@pytest.mark.slow
 def test_mounted_in_one_of_two_runs_declared_unloaded(
     truth: Truth, noisy_runs: tuple[Run, ...], undeclared: tuple[Run, ...]
 ) -> None:
@@ -49,6 +51,7 @@ def test_mounted_in_one_of_two_runs_declared_unloaded(
         identify(truth.model, runs, CONDITIONING)
 
 
+@pytest.mark.slow
 def test_forgotten_in_a_run_declared_loaded(truth: Truth, noisy_runs: tuple[Run, ...]) -> None:
     changed_noisy_run = replace(noisy_runs[0], payload=MOUNTED)
     runs = (changed_noisy_run, *noisy_runs[1:3])
@@ -76,6 +79,7 @@ def test_exchanged_roles_turn_every_sign_and_friction_shows_it(
     assert estimate.gains == pytest.approx(-GAINS, rel=0.05)
 
 
+@pytest.mark.slow
 def test_currents_of_another_sign_are_no_exchanged_roles(
     truth: Truth, noisy_runs: tuple[Run, ...]
 ) -> None:
@@ -97,6 +101,7 @@ def test_fixed_gains_of_the_wrong_sign_are_refused(
             identify(truth.model, noisy_runs[:1], CONDITIONING, method=method, fixed_gains=-GAINS)
 
 
+@pytest.mark.slow
 def test_a_robot_without_dry_friction_is_not_refused(truth: Truth) -> None:
     """Its friction is identified as zero, above or below by chance."""
     rng = np.random.default_rng(4)
@@ -141,6 +146,7 @@ def test_gains_beside_which_the_payload_weighs_nothing_have_no_scale(
         require_seen_payload(away, found.system)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("order", "method"),
     [

@@ -41,6 +41,7 @@ def test_masses_that_agree_are_not_named() -> None:
     assert not of_payloads(recordings(DECLARED_KG))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("times", "first"), [(1.3, "plate"), (0.75, "disc")])
 def test_masses_that_contradict_each_other_are_named_together(times: float, first: str) -> None:
     runs = recordings(times * DECLARED_KG)
@@ -53,6 +54,7 @@ def test_masses_that_contradict_each_other_are_named_together(times: float, firs
     assert said == pytest.approx(ratio, rel=0.05)
 
 
+@pytest.mark.slow
 def test_masses_that_leave_no_scale_are_refused_by_the_same_name() -> None:
     plate_kg = 3.0 * DECLARED_KG
     with pytest.raises(
@@ -63,6 +65,7 @@ def test_masses_that_leave_no_scale_are_refused_by_the_same_name() -> None:
         diagnosed(TRUTH, recordings(plate_kg))
 
 
+@pytest.mark.slow
 def test_another_body_in_one_run_is_no_contradiction_of_masses() -> None:
     """Two runs carry the disc, and the moves of one of them deny it."""
     bodies = {3: 0.7 * BODY, 7: BODY * (DECLARED_KG / BODY[-1])}

@@ -49,6 +49,7 @@ def test_recordings_without_noise_give_gains_and_parameters_back(
     assert parameters[: len(expected)] == pytest.approx(expected, rel=1e-3, abs=2e-3)
 
 
+@pytest.mark.slow
 def test_a_closed_chain_with_a_motor_for_each_freedom_is_one_of_these_robots() -> None:
     made = recorded(FIVE_BAR)
     system = regrouped(reduce_runs(made.model, made.runs, made.conditioning))

@@ -104,6 +104,7 @@ def test_least_squares_scatters_as_equation_10_says() -> None:
     _agree(measured, claimed)
 
 
+@pytest.mark.slow
 def test_weighting_rows_by_joint_gains_what_it_says() -> None:
     """The second joint four times as noisy:
     WLS knows, LS claims one σ for both and scatters more.

@@ -214,10 +214,12 @@ def _gains(recordings: tuple[Run, ...], multiplier: float) -> FloatArray:
     return np.asarray(estimate.gains)
 
 
+@pytest.mark.slow
 def test_the_gains_of_an_arm_with_a_follower_are_found(recordings: tuple[Run, ...]) -> None:
     np.testing.assert_allclose(_gains(recordings, MULTIPLIER), GAINS, rtol=5e-3)
 
 
+@pytest.mark.slow
 def test_a_wrong_multiplier_bends_the_gains_or_is_refused(recordings: tuple[Run, ...]) -> None:
     """Without it, the gains above could be right whatever is done with the ratio."""
     error = np.abs(_gains(recordings, -1.4) / GAINS - 1.0)

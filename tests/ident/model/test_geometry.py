@@ -218,6 +218,7 @@ def test_the_derivative_of_the_torques_is_that_of_the_simulated_five_bar() -> No
         assert_allclose(found, expected, atol=2e-3 * largest_absolute_expected)
 
 
+@pytest.mark.slow
 def test_the_torque_beside_a_redundant_robot_is_the_derivative_times_the_change() -> None:
     """To first order: halving the change quarters what the derivative leaves."""
     model = PLANAR.model

@@ -83,6 +83,7 @@ def test_robots_of_others_are_read_as_pinocchio_reads_them(name: str, shared_dat
     _assert_read_as_pinocchio_reads(urdf)
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=150, derandomize=True)
 @given(seed=st.integers(0, 1_000_000), count=st.integers(2, 14))
 def test_any_tree_is_read_as_pinocchio_reads_it(seed: int, count: int) -> None:

@@ -103,6 +103,7 @@ def test_data_and_a_prior_without_errors_give_the_robot(
     assert not full.bounded
 
 
+@pytest.mark.slow
 def test_sigma_is_true_and_nothing_is_bent(small: Evidence, small_truth: Truth) -> None:
     found = small.identification
     exact = _with_truth(found, small_truth)

@@ -224,6 +224,7 @@ def test_no_other_body_of_the_same_torque_is_nearer_to_the_prior() -> None:
         assert distance(found.standard + 1e-3 * direction) >= least - 1e-7
 
 
+@pytest.mark.slow
 def test_friction_that_would_push_is_taken_to_zero_unless_it_is_only_a_part() -> None:
     model = _model(TX40)
     motion = _motion(model, 1)
@@ -269,6 +270,7 @@ def test_numbers_that_are_none_are_refused() -> None:
         physical_parameters(model, base, values, columns, prior)
 
 
+@pytest.mark.slow
 @given(seed=st.integers(0, 10**6))
 def test_the_pseudo_inertia_knows_a_body(seed: int) -> None:
     rng = np.random.default_rng(seed)

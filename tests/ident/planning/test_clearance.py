@@ -83,6 +83,7 @@ def test_distances_are_those_of_the_segments() -> None:
         assert float(checker.margins(position)[0]) == pytest.approx(expected, abs=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("arm", [TX40, SEVEN_AXES, GANTRY], ids=lambda arm: arm.name)
 def test_a_way_that_is_called_clear_is_clear_everywhere(arm: Arm) -> None:
     robot = robot_from_urdf(arm.urdf)

@@ -54,6 +54,7 @@ def _distance(
     return float(coal.distance(*first, *second, coal.DistanceRequest(), coal.DistanceResult()))
 
 
+@pytest.mark.slow
 def test_distances_of_capsules_are_those_of_coal() -> None:
     ends = _segments(0)
     expected = [_distance(_capsule(a, b), _capsule(c, d)) for a, b, c, d in zip(*ends, strict=True)]
@@ -63,6 +64,7 @@ def test_distances_of_capsules_are_those_of_coal() -> None:
     assert (found == 0.0).any()  # segments of the grid that cross
 
 
+@pytest.mark.slow
 def test_distances_to_boxes_and_depths_inside_are_those_of_coal() -> None:
     start, end, corner, size = _segments(1)
     lower = 0.5 * corner

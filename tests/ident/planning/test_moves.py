@@ -110,6 +110,7 @@ def _parameters(model: ident.Model, payload: ident.Payload | None) -> FloatArray
     return parameters
 
 
+@pytest.mark.slow
 def test_a_fit_of_planned_moves_has_smaller_deviations_than_of_random_ones(
     model: ident.Model, plan: ident.PlannedMoves
 ) -> None:
