@@ -441,10 +441,10 @@ def _usage_failed(error: Any, words: list[str], json_wanted: bool) -> int:
         error.show()  # a verb without arguments shows its help
         return ExitCode.USAGE
     command = "drivegain"
-    usage = "a value for this option"
+    expected = "a value for this option"
     if error.ctx is not None:
         command = error.ctx.command_path
-        usage = error.ctx.get_usage()
+        expected = error.ctx.get_usage()
     elif verb := _verb_of(words):
         # The parser knows no verb where an option ends the line without its value.
         command = f"drivegain {verb}"
@@ -457,7 +457,7 @@ def _usage_failed(error: Any, words: list[str], json_wanted: bool) -> int:
             shown = max(param.opts, key=len)
         found = found.replace(f"'{param.display_name_raw}'", f"'{shown}'", 1)
         if type(error).__name__ == MISSING:
-            usage = _wanted(shown, param)
+            expected = _wanted(shown, param)
     remedy = f"`{command} --help` explains it"
     # A value of the wrong type: the message of typer's validation does not repeat it.
     given = [one["input"] for one in getattr(error.__cause__, "errors", list)()]
@@ -465,7 +465,7 @@ def _usage_failed(error: Any, words: list[str], json_wanted: bool) -> int:
         found = f"{given[0]!r}: {found}"
         if re.fullmatch(r"[+-]?\d*,\d+", given[0]):
             remedy = f"write a decimal point: {given[0].replace(',', '.')}"
-    failure = ErrorParts("UsageError", command, found, usage, remedy, ExitCode.USAGE)
+    failure = ErrorParts("UsageError", command, found, expected, remedy, ExitCode.USAGE)
     show_failure(failure, json_wanted=json_wanted)
     return ExitCode.USAGE
 

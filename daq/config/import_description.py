@@ -376,13 +376,13 @@ def load_import(path: Path) -> ImportDescription:
                 f"the unit of the log for each unit in the file, at least {SMALLEST_FACTOR:g}"
             )
             faults.append(Fault((name, "factor"), f"{min(factors, key=abs):g}", expected))
-        # One name may be a whole matrix or field (daq.log.importing.with_columns); then the import
-        # counts.
         reversed_axes = Counter(getattr(section, "reversed", ()))
         repeated = [axis for axis, count in reversed_axes.items() if count > 1]
         if repeated:
             found = f"{', '.join(repeated)} more than once"
             faults.append(Fault((name, "reversed"), found, "each axis once"))
+        # One name may be a whole matrix or field (daq.log.importing.with_columns); then the import
+        # counts.
         own = len(section.places)
         if own != axes and 1 not in {axes, own}:
             found = f"{own} columns"

@@ -578,11 +578,12 @@ def _path_in_file(item: Any, tree: Any) -> Location:
         is_last = place == len(parts) - 1
         is_key = isinstance(here, dict) and part in here
         is_index = isinstance(here, list) and isinstance(part, int) and part < len(here)
-        if is_key or is_index:
+        is_there = is_key or is_index
+        is_missing_key = is_last and item["type"] == "missing"
+        if is_there or is_missing_key:
+            path.append(part)
+        if is_there:
             here = here[part]
-        elif not (is_last and item["type"] == "missing"):
-            continue
-        path.append(part)
     return tuple(path)
 
 

@@ -243,31 +243,36 @@ class RecordFile:
         start = stream.read(len(MAGIC))
         if 0 < size < len(MAGIC) and MAGIC.startswith(start):
             raise self._truncated(size, None)
+        if start.startswith(MAGIC_OF_LOGS) and not MAGIC.startswith(start):
+            raise self._other_mark(start)
         if not MAGIC.startswith(start):
-            is_text = all(byte in b"\t\n\r" or 0x20 <= byte < 0x7F for byte in start)
-            remedy = f"is this the right file? {IN_ORDER}"
-            kind = kind_of_file(self.path)
-            foreign = foreign_kind(start + stream.read(FOREIGN_BYTES))
-            if start.startswith(MAGIC_OF_LOGS):
-                raise self._other_mark(start)
-            if foreign is not None:
-                found = foreign.value
-                remedy = foreign.remedy
-            elif kind is not None:
-                found = kind.value
-            elif is_text:
-                found = f"a text file that begins with {start.decode()!r}"
-            else:
-                found = f"first bytes {start!r}"
-            raise LogForeign(str(self.path), found=found, expected="a log (MCAP)", remedy=remedy)
+            raise self._other_file(start, start + stream.read(FOREIGN_BYTES))
+
+    def _other_file(self, start: bytes, head: bytes) -> LogForeign:
+        """Make the error for a file that is no MCAP file, from its first bytes."""
+        remedy = f"is this the right file? {IN_ORDER}"
+        is_text = all(byte in b"\t\n\r" or 0x20 <= byte < 0x7F for byte in start)
+        kind = kind_of_file(self.path)
+        foreign = foreign_kind(head)
+        if foreign is not None:
+            found = foreign.value
+            remedy = foreign.remedy
+        elif kind is not None:
+            found = kind.value
+        elif is_text:
+            found = f"a text file that begins with {start.decode()!r}"
+        else:
+            found = f"first bytes {start!r}"
+        return LogForeign(str(self.path), found=found, expected="a log (MCAP)", remedy=remedy)
 
     def _other_mark(self, start: bytes) -> LogUnreadable:
         """Make the error for an MCAP file with another opening mark than ours.
 
         The mark ends in a carriage return and a line feed, so that a copy in text mode shows.
         """
-        version = start[len(MAGIC_OF_LOGS) : len(MAGIC_OF_LOGS) + 1]
-        if version == MAGIC[len(MAGIC_OF_LOGS) : len(MAGIC_OF_LOGS) + 1]:
+        at_version = slice(len(MAGIC_OF_LOGS), len(MAGIC_OF_LOGS) + 1)
+        version = start[at_version]
+        if version == MAGIC[at_version]:
             return LogCorrupt(
                 f"{self.path}, byte 0",
                 found=f"an opening mark of {start!r}",

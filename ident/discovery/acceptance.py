@@ -85,7 +85,7 @@ def accept_on_holdout(
     last = steps[-1]
     to_judge = found
     while True:
-        confirmed = _judged(
+        kept = _judged(
             start,
             to_judge,
             verdicts,
@@ -93,12 +93,12 @@ def accept_on_holdout(
             progress=progress,
             names=names,
         )
-        if confirmed.effects != last.after.effects:
-            undecided = _undecided(found, confirmed, verdicts)
-            model = _fitted_again(start, found, confirmed)
+        if kept.effects != last.after.effects:
+            undecided = _undecided(found, kept, verdicts)
+            model = _fitted_again(start, found, kept)
             last = _ended_again(steps, last, model, gates or Gates(), bootstrap, undecided)
         # What no longer passes in this fit has left: the effects beside it are judged again.
-        is_pruned = len(last.after.effects) < len(confirmed.effects)
+        is_pruned = len(last.after.effects) < len(kept.effects)
         if not is_pruned:
             break
         to_judge = last.after
@@ -111,12 +111,14 @@ def accept_on_holdout(
     return (*steps[:-1], replace(last, verdicts=tuple(ordered)))
 
 
-def _fitted_again(start: Evidence, found: Evidence, confirmed: Evidence) -> JointFit:
-    """The model of the search refitted with the confirmed effects alone."""
-    if confirmed is start:
+def _fitted_again(start: Evidence, found: Evidence, kept: Evidence) -> JointFit:
+    """The model of the search refitted with the effects that are kept alone; where nothing can be
+    fitted without one that leaves, the model without effects.
+    """
+    if kept is start:
         refitted = start
     else:
-        refitted = replace(with_effects(found, confirmed.effects), declared=found.declared)
+        refitted = replace(with_effects(found, kept.effects), declared=found.declared)
     return linearised(refitted, ColumnCache())
 
 
@@ -280,8 +282,8 @@ def _without(evidence: Evidence, left_out: PlacedEffect) -> Evidence:
     holdout = evidence.holdout
     if holdout is not None:
         holdout = replace(holdout, columns=training.columns, effects=holdout.effects[:, stays])
-    described = evidence.estimate
-    estimate = estimate_with(described.method, training.system(), described.fixed_gains)
+    with_all = evidence.estimate
+    estimate = estimate_with(with_all.method, training.system(), with_all.fixed_gains)
     return replace(evidence, training=training, holdout=holdout, effects=others, estimate=estimate)
 
 

@@ -169,8 +169,7 @@ def find_effects(
     It ends when nothing passes, at one effect for PIECES_PER_EFFECT pieces, or after MAX_EFFECTS
     turns. The covariance of the last estimate includes the choice of its effects in the σ of gains
     and parameters (`choice_covariance`). An effect that its own σ does not show leaves
-    (`end_search`). Held-out
-    runs take no part in it: `ident.discovery.acceptance` judges by them.
+    (`end_search`). Held-out runs take no part in it: `ident.discovery.acceptance` judges by them.
 
     Args:
         start: identified by ``ml``, from `gather`.

@@ -25,21 +25,22 @@ from pathlib import Path
 
 import numpy as np
 
-from daq.config.cell import model_of
+from daq.config.cell import Cell, model_of
 from daq.config.cell_file import load_cell
 from daq.files import replace_file
 from drivers.simulation.spec import UndeclaredEffect
 from ident.arrays import FloatArray
 from ident.discovery.evidence import Evidence, by_instruments, gather
-from ident.discovery.loop import find_effects
+from ident.discovery.loop import Step, find_effects
 from ident.effects.dictionary import EFFECTS
-from ident.effects.effect import GearSide, PlacedEffect
+from ident.effects.effect import Effect, GearSide, PlacedEffect
 from ident.estimators.estimate import Estimate
 from ident.estimators.identify import identify
 from tests.studies.blind_cells import blind_cases, confusion
 from tests.studies.effect_cells import APART, CLEAN, FURTHER, SINGLES, SMALLS, TOGETHER, EffectCase
 from tests.studies.effect_runs import (
     DURATION_S,
+    CaseRuns,
     CaseTask,
     fingerprint_of_runs,
     load_runs,
@@ -267,6 +268,16 @@ def _work(task: _Task) -> tuple[str, ...]:
     return tuple(lines)
 
 
+def search_runs(
+    cell: Cell, runs: CaseRuns, families: tuple[tuple[Effect, ...], ...] = EFFECTS
+) -> tuple[Evidence, tuple[Step, ...]]:
+    """Identify the runs of a case and search them: the model without effects, and the turns."""
+    found = identify(model_of(cell), runs.fit, cell.conditioning)
+    start = gather(found, runs.fit, runs.held_out)
+    rng = np.random.default_rng(0)
+    return start, find_effects(start, rng, families=families)
+
+
 def _search(task: CaseTask, part: str, simulation_s: float) -> Row:
     case = task.case
     cell = load_cell(CELL)
@@ -275,10 +286,7 @@ def _search(task: CaseTask, part: str, simulation_s: float) -> Row:
     removed = (lacking, *SAME.get(lacking, ()))
     families = tuple(family for family in EFFECTS if family[0].name not in removed)
     begun_s = time.process_time()
-    found = identify(model_of(cell), runs.fit, cell.conditioning)
-    start = gather(found, runs.fit, runs.held_out)
-    rng = np.random.default_rng(0)
-    steps = find_effects(start, rng, families=families)
+    start, steps = search_runs(cell, runs, families)
     spent_s = time.process_time() - begun_s
     axes = world_cell(case.seed, task.world).bare.axes
     gain_nm_per_a = [axis.gain_nm_per_a for axis in axes]
