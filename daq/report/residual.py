@@ -15,6 +15,7 @@ from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
 from rich.table import Table
 
 from daq.errors import counted, first_few
+from daq.report.described_geometry import geometry_before_search
 from daq.report.effect_names import effect_text, size_text, variable_text
 from daq.report.fit import coefficients, error_table, identifiability_notes, sigma_notes
 from daq.report.gains import diagnosis_texts, gain_table, partial_note, with_deviation
@@ -71,6 +72,7 @@ def residual_view(
         )
     statistics = (
         *statistical_sentences(fitted, account),
+        *geometry_before_search(fitted, calibration.diagnoses),
         *identifiability_notes(fitted, calibration.payload_mass),
     )
     if verbose:

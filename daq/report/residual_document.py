@@ -6,7 +6,9 @@ from __future__ import annotations
 
 from typing import Any, Literal, TypeVar
 
+from daq.config.cell import robot_of
 from daq.documents.calibration_file import CalibrationBody
+from daq.report.described_geometry import CheckedGeometry, checked_geometry
 from daq.report.document import Figure, Report
 from daq.report.fit import Errors, coefficients, with_calibration
 from daq.report.residual import summary
@@ -220,6 +222,7 @@ class ResidualReport(CalibrationBody, Report):
     noise_floor: NoiseFloor
     time_skew: Skew | None
     time_skew_by_instruments: SkewByInstruments | None
+    geometry: CheckedGeometry | None
     gear_loss: list[GearLossEntry]
     before: ModelErrors
     after: ModelErrors
@@ -259,6 +262,9 @@ def residual_report(fitted: Fit, account: Account, calibration: Calibration) -> 
     worse_holdout = None
     if account.holdout_change is not None:
         worse_holdout = account.holdout_change.is_harm
+    geometry = checked_geometry(
+        fitted.description, axes, robot_of(fitted.cell), calibration.diagnoses
+    )
     gear_loss = []
     for axis, gear in zip(axes, gear_losses(last), strict=True):
         gear_loss.append(GearLossEntry.of(gear, axis=axis))
@@ -275,6 +281,7 @@ def residual_report(fitted: Fit, account: Account, calibration: Calibration) -> 
         noise_floor=_noise_floor(account, axes),
         time_skew=confirmed_skew,
         time_skew_by_instruments=account.skew,
+        geometry=geometry,
         gear_loss=gear_loss,
         before=_model_errors(account.total.before),
         after=_model_errors(account.total.after),

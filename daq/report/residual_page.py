@@ -17,6 +17,7 @@ from daq.ledger.ledger import Standing
 from daq.report.certificate import Origin, certify
 from daq.report.certificate_page import certificate_page
 from daq.report.comparison import Comparison, without_controller
+from daq.report.described_geometry import geometry_before_search
 from daq.report.document import json_text
 from daq.report.effect_names import effect_text, variable_text
 from daq.report.fit import coefficients, identifiability_notes, start_of
@@ -311,6 +312,7 @@ def _turn(fitted: Fit, number: int, step: Step) -> str:
 
 def _limits(fitted: Fit, calibration: Calibration) -> str:
     limits = [
+        *geometry_before_search(fitted, calibration.diagnoses),
         *identifiability_notes(fitted, calibration.payload_mass),
         "A torque constant that is wrong by a constant factor is part of the gain, and an effect "
         "that is the same at every speed, load and position is part of the parameters: neither "

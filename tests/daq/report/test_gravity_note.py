@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from daq.report.fit import checked_geometry, geometry_notes
+from daq.report.described_geometry import checked_geometry, geometry_notes
 from ident.discovery.geometry_check import GeometryCheck, Gravity
 from ident.errors import Diagnosis
 from tests.ident.recordings import three_axes_truth

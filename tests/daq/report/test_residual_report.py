@@ -217,6 +217,25 @@ def test_an_axis_that_rests_in_the_held_out_runs_has_the_error_of_moves_left_out
     assert "on moves left out in turn" in found
 
 
+@pytest.mark.slow
+def test_a_search_says_what_the_torques_say_of_the_description(closed: Closed) -> None:
+    """The gravity of the fit before the search, in `--verbose`, on the page and under --json."""
+    check = closed.fitted.description
+    assert check is not None
+    assert check.gravity is not None
+    turn_deg = np.degrees(check.gravity.turn_rad)
+    std_deg = np.degrees(check.gravity.turn_std_rad)
+    said = f"By the torques before the search, gravity is {turn_deg:.2f} ± {std_deg:.2f}°"
+    calibration = calibration_of(closed.fitted, CREATED)
+    shown = residual_view(closed.fitted, closed.account, calibration, verbose=True)
+    (sentence,) = (part for part in shown if isinstance(part, Sentence) and said in str(part))
+    assert "from its direction in the cell file" in str(sentence)
+    assert said in closed.page()
+    gravity = closed.document()["geometry"]["gravity"]
+    assert gravity["turn_deg"] == pytest.approx(turn_deg, rel=1e-6)
+    assert gravity["turn_std_deg"] == pytest.approx(std_deg, rel=1e-6)
+
+
 def test_gravity_is_placed_on_all_axes_in_the_document(closed: Closed) -> None:
     first, last = closed.fitted.steps
     placed = PlacedEffect(GravityDirection(), 0)
