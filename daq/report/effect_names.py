@@ -115,9 +115,10 @@ def effect_text(effect: Effect, axes: tuple[str, ...]) -> str:
 def variable_text(effect: Effect, axes: tuple[str, ...]) -> str:
     """Name the variable that an effect depends on, without its unit: `the joint position`."""
     other = other_axis(effect)
-    if effect.abscissa is Abscissa.OTHER_VELOCITY and other is not None:
-        return f"the velocity of {axes[other]}"
-    return "the " + effect.abscissa.value.partition(" [")[0]
+    quantity = effect.abscissa.value.partition(" [")[0]
+    if effect.abscissa.is_of_other_joint and other is not None:
+        quantity = quantity.replace("the other joint", axes[other])
+    return f"the {quantity}"
 
 
 def variable_label(effect: Effect, axes: tuple[str, ...], force: str) -> str:
@@ -128,11 +129,8 @@ def variable_label(effect: Effect, axes: tuple[str, ...], force: str) -> str:
     label = (
         f"{variable_text(effect, axes).removeprefix('the ')} [{abscissa.value.partition(' [')[2]}"
     )
-    if force != "N" or abscissa in {
-        Abscissa.MOTOR_ANGLE,
-        Abscissa.CURRENT,
-        Abscissa.OTHER_VELOCITY,
-    }:
+    is_of_other_unit = abscissa in {Abscissa.MOTOR_ANGLE, Abscissa.CURRENT}
+    if force != "N" or is_of_other_unit or abscissa.is_of_other_joint:
         return label
     return label.replace("rad", "m").replace("Nm", "N").replace("torque", "force")
 

@@ -43,6 +43,7 @@ RECORD = {
     Abscissa.LOAD_CURVATURE: "moves with fast starts and stops of this axis",
     Abscissa.DISTANCE: "moves with reversals of this axis",
     Abscissa.OTHER_VELOCITY: "moves of both joints at once",
+    Abscissa.OTHER_ACCELERATION: "moves with fast starts and stops of the other joint",
     Abscissa.TEMPERATURE: "runs at other temperatures",
 }
 """What to record for an effect that shows itself against a variable."""

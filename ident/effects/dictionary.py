@@ -113,5 +113,9 @@ GEOMETRY: tuple[Family, ...] = (
 )
 """What the description may have wrong: effects that correct it (`geometry_corrections`)."""
 
-UNNAMED: Family = (Periodic(), *(Smooth(variable) for variable in Abscissa))
+SMOOTH_VARIABLES = tuple(
+    variable for variable in Abscissa if variable is not Abscissa.OTHER_ACCELERATION
+)
+"""Variables of a smooth term; what follows the acceleration of another joint is its inertia."""
+UNNAMED: Family = (Periodic(), *(Smooth(variable) for variable in SMOOTH_VARIABLES))
 """Terms that fit anything: for structure in a residual that no name explains."""

@@ -43,7 +43,13 @@ class Abscissa(Enum):
     LOAD_CURVATURE = "second derivative of the load torque [Nm/s²]"
     DISTANCE = "way since the last reversal [rad]"
     OTHER_VELOCITY = "velocity of the other joint [rad/s]"
+    OTHER_ACCELERATION = "acceleration of the other joint [rad/s²]"
     TEMPERATURE = "temperature of the motor or its drive [°C]"
+
+    @property
+    def is_of_other_joint(self) -> bool:
+        """Whether the variable is that of a second joint."""
+        return self in {Abscissa.OTHER_VELOCITY, Abscissa.OTHER_ACCELERATION}
 
     @property
     def is_independent_of_model(self) -> bool:
@@ -232,9 +238,9 @@ class Signals:
         Args:
             abscissa: the variable.
             axis: the axis.
-            other: second axis, of OTHER_VELOCITY; the same one when None.
+            other: second axis, of a variable of another joint; the same one when None.
         """
-        if abscissa is Abscissa.OTHER_VELOCITY and other is not None:
+        if abscissa.is_of_other_joint and other is not None:
             axis = other
         return np.asarray(self._variable(abscissa, axis), dtype=np.float64)
 
@@ -243,6 +249,8 @@ class Signals:
         match abscissa:
             case Abscissa.VELOCITY | Abscissa.OTHER_VELOCITY:
                 variable = self.velocity_rad_s[axis]
+            case Abscissa.OTHER_ACCELERATION:
+                variable = self.acceleration_rad_s2[axis]
             case Abscissa.POSITION:
                 variable = self.position_rad[axis]
             case Abscissa.LOAD:

@@ -229,7 +229,7 @@ class InertialCoupling(Effect):
     name = "inertial-coupling"
     side = GearSide.TWO_JOINTS
     declares = Property.INDEPENDENT_OF_VELOCITY
-    abscissa = Abscissa.OTHER_VELOCITY
+    abscissa = Abscissa.OTHER_ACCELERATION
     coefficients = (Column("inertia", "kg m²"),)
 
     other_axis: AxisNumber  #: number of joint j, from 1; joint i is the one with the lower number

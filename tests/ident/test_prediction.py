@@ -23,7 +23,6 @@ from ident.effects.effect import ALL_AXES, Effect, GearSide, PlacedEffect, check
 from ident.effects.electrical import Cogging, Lag, Saturation, TimeSkew
 from ident.effects.friction import LoadFriction, NonlinearViscous, Stribeck, WarmUp
 from ident.effects.position import Spring
-from ident.effects.signals import Abscissa
 from ident.effects.transmission import Elasticity
 from ident.equations.rows import decimate_rows, row_masks
 from ident.errors import DataUnfit, EffectRefused, ModelError
@@ -383,7 +382,7 @@ def test_an_effect_of_an_earlier_version_is_that_of_first_order(
 def test_every_effect_of_the_dictionary_has_settings_that_an_effect_can_have() -> None:
     for effect in (*chain.from_iterable(EFFECTS), *UNNAMED):
         given_ = dict(effect.settings)
-        if effect.abscissa is Abscissa.OTHER_VELOCITY:
+        if effect.abscissa.is_of_other_joint:
             given_["other_axis"] = given_["other_axis"] or 2
         check_settings(effect, given_, 0, 12)
 

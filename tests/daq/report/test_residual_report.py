@@ -34,7 +34,7 @@ from daq.environment import shipped_configurations
 from daq.errors import EffectsRefuted, ExitCode, OutputFailed, UsageError, counted
 from daq.report import residual_page as residual_page_module
 from daq.report.document import json_text
-from daq.report.effect_names import WORDS, effect_text, named_size, other_axis
+from daq.report.effect_names import WORDS, effect_text, named_size, other_axis, variable_text
 from daq.report.fit import coefficients
 from daq.report.html import html_page, paragraph, table
 from daq.report.plots import draw_fit
@@ -77,6 +77,7 @@ from ident.effects.friction import Coupling, LoadFriction
 from ident.effects.geometry_corrections import GravityDirection, ZeroOffset
 from ident.effects.position import Spring
 from ident.effects.signals import Abscissa
+from ident.effects.transmission import InertialCoupling
 from ident.effects.unnamed import Periodic, Smooth
 from ident.errors import Diagnosis
 from ident.estimators.estimate import RelativeError
@@ -1275,6 +1276,7 @@ def test_effects_are_called_by_words_and_axes_by_names() -> None:
     assert effect_text(term, axes) == (
         "a torque that depends on the velocity of arm and that no named effect explains"
     )
+    assert variable_text(InertialCoupling(3), axes) == "the acceleration of wrist"
     assert other_axis(Spring()) is None
     assert set(WORDS) <= {family[0].name for family in (*EFFECTS, *GEOMETRY)}
 

@@ -25,7 +25,7 @@ from ident.effects.friction import (
 from ident.effects.position import Hinge, Spring
 from ident.effects.rotor import beside_rotors
 from ident.effects.signals import Abscissa, Signals
-from ident.effects.transmission import Efficiency, Elasticity
+from ident.effects.transmission import Efficiency, Elasticity, InertialCoupling
 from ident.effects.unnamed import INTERVALS, Periodic, Smooth
 from ident.model.model import DriveTrain
 from ident.model.urdf import robot_from_urdf
@@ -466,3 +466,13 @@ def test_effects_behind_the_gear_leave_a_known_rotor_out() -> None:
     assert not np.allclose(Elasticity().columns(known, axis), Elasticity().columns(s, axis))
     placed_effect = PlacedEffect(LoadFriction(0), axis)
     assert beside_rotors(s, (placed_effect,)) is s
+
+
+def test_an_inertial_coupling_against_its_variable_is_a_straight_line() -> None:
+    """A picture of it against the velocity would be a cloud."""
+    signals = random_signals(7)
+    coupling = InertialCoupling(4)
+    on_both_nm = coupling.columns(signals, 1)
+    on_own_joint_nm = on_both_nm[0, 0]
+    along = signals.variable(coupling.abscissa, 1, other=3)
+    assert np.array_equal(on_own_joint_nm, along)
