@@ -271,5 +271,5 @@ def plot_ranking(
         if (one.effect.name, one.axis) in alike:
             kind = "alike"
         name = f"{axes[one.axis]}: {effect_text(one.effect, axes)}"
-        rows.append((name, one.held_out_fall, kind))
+        rows.append((name, one.left_out_fall, kind))
     return ranking(rows, "Candidates", "squared error that it removes")

@@ -621,7 +621,7 @@ def _on_few_moves(fitted: Fit) -> Iterator[str]:
     for finding in fitted.steps[-1].findings:
         # `_refused` names a large one with all that it failed.
         is_of_size = LITTLE <= finding.explained < MUCH
-        helps = finding.held_out_fall > 0.0 and finding.folds_better >= MOST
+        helps = finding.left_out_fall > 0.0 and finding.folds_better >= MOST
         is_possible = not finding.impossible
         if finding.too_few_moves and is_of_size and helps and is_possible:
             best.setdefault(finding.axis, finding)

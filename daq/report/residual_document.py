@@ -427,5 +427,6 @@ def _finding(finding: Finding, axes: tuple[str, ...]) -> FindingEntry:
         finding,
         variable=finding.effect.abscissa,
         coefficients=found,
+        held_out_fall=finding.left_out_fall,
         ambiguity=ambiguity,
     )

@@ -293,7 +293,7 @@ def _turn(fitted: Fit, number: int, step: Step) -> str:
     shown = (*named, *structures)
     ranking = paragraph("No candidate could be tried.")
     if shown:
-        ranked = sorted(shown, key=lambda finding: -finding.held_out_fall)
+        ranked = sorted(shown, key=lambda finding: -finding.left_out_fall)
         caption = (
             "Candidates by how much they reduce the error of left-out moves. Full: passed every "
             "check of the search; the fit of everything together comes after it. Pale: these data "

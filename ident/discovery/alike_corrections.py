@@ -24,22 +24,22 @@ WIDE_RAD = float(np.deg2rad(120.0))  #: Range of a joint that turns the arm behi
 
 
 def explains_beside(
-    problem: SearchProblem, torque_nm: FloatArray, held_out_fall: float, rival_nm: FloatArray
+    problem: SearchProblem, torque_nm: FloatArray, left_out_fall: float, rival_nm: FloatArray
 ) -> bool:
     """Whether a mistake explains most of what it does beside another effect, too.
 
     Args:
         problem: around the fit.
         torque_nm: columns of the mistake at the joints, shape (m, p, r).
-        held_out_fall: of ‖e‖² on held-out moves, by the mistake alone.
+        left_out_fall: of ‖e‖² on left-out moves, by the mistake alone.
         rival_nm: columns of the other effect.
     """
     both_nm = np.concatenate((rival_nm, torque_nm), axis=1)
     alone, both = problem.trials([rival_nm, both_nm])
     if alone is None or both is None:
         return False
-    fall = float(alone.held_out.sum() - both.held_out.sum())
-    return fall >= OWN_SHARE * held_out_fall
+    fall = float(alone.left_out.sum() - both.left_out.sum())
+    return fall >= OWN_SHARE * left_out_fall
 
 
 def alike_corrections(
@@ -60,7 +60,7 @@ def alike_corrections(
         if other.placed not in correction.ambiguity or other.impossible:
             continue
         of_other_nm = problem.torque_at_rows(other.effect, other.axis)
-        if not explains_beside(problem, torque_nm, correction.held_out_fall, of_other_nm):
+        if not explains_beside(problem, torque_nm, correction.left_out_fall, of_other_nm):
             alike.append(other)
     return tuple(alike)
 

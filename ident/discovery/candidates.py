@@ -1,5 +1,5 @@
 """Candidates tested on a residual: the search problem, and trials of effects on it,
-in-sample and on held-out moves.
+in-sample and on left-out moves.
 
 Friction differs from run to run, as temperature and mounting do. A search that took moves of all
 runs as exchangeable would find laws in that. So `prepare_search` takes the friction of every run as
@@ -9,7 +9,7 @@ shifts of gains are those of the estimate (`Folds.estimate_factor`).
 
 A *candidate* is an effect with one choice of settings on one axis. A *trial* projects its columns
 off all declared directions, gains included, and measures what they explain of the residual:
-in-sample, and on folds of held-out moves. A *family* is one effect with all settings that the
+in-sample, and on folds of left-out moves. A *family* is one effect with all settings that the
 dictionary tries.
 """
 
@@ -215,7 +215,7 @@ class FamilyTrials:
         trials = [trial for _, trial in self.members]
         training_falls = np.stack([trial.training_fall for trial in trials])
         chosen = np.argmax(training_falls, axis=0)
-        squares = [trials[best].held_out[fold] for fold, best in enumerate(chosen)]
+        squares = [trials[best].left_out[fold] for fold, best in enumerate(chosen)]
         return np.stack(squares)
 
 
@@ -228,7 +228,7 @@ class CandidateTrial:
     #: fall of ‖e‖² on the other folds, by which a setting may be chosen, shape (folds,)
     training_fall: FloatArray
     #: ‖e‖² of each fold and motor with the candidate fitted on the others, shape (folds, m)
-    held_out: FloatArray
+    left_out: FloatArray
     score: FloatArray  #: Φ⊥ᵀe, shape (p,)
     #: Φ⊥ᵀe of each cluster with the candidate fitted: its noise alone, shape (clusters, p)
     scatter: FloatArray
@@ -495,7 +495,7 @@ def _tried_on_folds(
 ) -> tuple[CandidateTrial, ...]:
     """Test c candidates that the declared model lacks, on moves and on folds.
 
-    See `_scored_together` and `_HeldOut`.
+    See `_scored_together` and `_LeftOut`.
     """
     along = projection.along
     # Φ⊥ = Φ − J H⁻¹ JᵀΦ, of each cluster.
@@ -513,15 +513,15 @@ def _tried_on_folds(
     fallen = fall_of_motors(folds, sums, along, fitted)
     of_fit = (gram @ fitted[..., None])[..., 0]
     scatter = cluster_score - of_fit
-    held_out = _held_out(folds, before, made, sums)
+    left_out = _left_out(folds, before, made, sums)
     trials: list[CandidateTrial] = []
     for place in range(len(along)):
         own_gram = gram[:, place]
         trial = CandidateTrial(
             coefficients=fitted[place],
             fallen=fallen[place],
-            training_fall=held_out.training_fall[:, place],
-            held_out=held_out.squares[:, :, place],
+            training_fall=left_out.training_fall[:, place],
+            left_out=left_out.squares[:, :, place],
             score=score[place],
             scatter=scatter[:, place],
             gram=own_gram,
@@ -532,16 +532,16 @@ def _tried_on_folds(
 
 
 @dataclass(frozen=True, slots=True)
-class _HeldOut:
+class _LeftOut:
     """Candidates fitted without each fold, beside a model fitted without it."""
 
     training_fall: FloatArray  #: fall of ‖e‖² on the other folds, shape (folds, c)
     squares: FloatArray  #: ‖e‖² on the fold, shape (folds, m, c)
 
 
-def _held_out(
+def _left_out(
     folds: Folds, before: FloatArray, made: Sequence[_Products], sums: MotorSums
-) -> _HeldOut:
+) -> _LeftOut:
     """Fit candidates with J and Φ of the other folds, for each fold k: Φ − J w_k."""
     _, count, width, unknowns = sums.jacobian.shape
     # ΦᵀJ, ΦᵀΦ, Φᵀe and Φᵀr of each fold and motor.
@@ -550,7 +550,7 @@ def _held_out(
     part_jacobian = np.zeros((*parts, unknowns))
     part_gram = np.zeros((*parts, width))
     part_score = np.zeros(parts)
-    part_held = np.zeros(parts)
+    part_left_out = np.zeros(parts)
     for one in made:
         own = one.own
         place = np.s_[:, own.motor, one.felt]
@@ -560,7 +560,7 @@ def _held_out(
         part_jacobian[place] = jacobian
         part_gram[place] = own.by_fold(one.gram, folds.count)
         part_score[place] = own.by_fold(one.score, folds.count)
-        part_held[place] = own.by_fold(one.held, folds.count)
+        part_left_out[place] = own.by_fold(one.held, folds.count)
     # Of the other folds: all, less the fold's own part.
     coupling = sums.jacobian.sum(axis=0) - part_jacobian.sum(axis=1)
     step_of_folds: list[FloatArray] = []
@@ -577,7 +577,7 @@ def _held_out(
     drive -= (steps @ folds.scores[:, None, :, None])[..., 0]
     # (Φ − J w_k)ᵀr on the fold, motor by motor.
     along_jacobian = (steps[:, None] @ folds.part_score[:, :, None, :, None])[..., 0]
-    shown = part_held - along_jacobian
+    shown = part_left_out - along_jacobian
     # What the other folds do not show at all is left as it is: in its own unit, the shortest of all
     # solutions.
     unit = np.sqrt(sums.squares)
@@ -594,7 +594,7 @@ def _held_out(
     squares = before[:, :, None] - 2.0 * linear
     squares += np.einsum("kcp,kncpq,kcq->knc", without, inside, without)
     training_fall = np.sum(drive * without, axis=-1)
-    return _HeldOut(training_fall, squares)
+    return _LeftOut(training_fall, squares)
 
 
 def _shortest_inverse(matrices: FloatArray) -> FloatArray:

@@ -106,7 +106,7 @@ def scored_beside(search_problem: SearchProblem, finding: Finding) -> Finding | 
     trial = _trial_of(search_problem, columns)
     if trial is None:
         return None
-    fold_errors = trial.held_out.sum(axis=1)
+    fold_errors = trial.left_out.sum(axis=1)
     return replace(finding, coefficients=trial.coefficients, fold_errors=fold_errors)
 
 
@@ -131,7 +131,7 @@ def _by_open_effect(
     trial = _trial_of(search_problem, columns)
     if trial is None:
         return np.zeros((0, size))
-    with_effect = trial.held_out.sum(axis=1)
+    with_effect = trial.left_out.sum(axis=1)
     weight = _weights(fold_errors, with_effect[None])
     moved = shifts_by(search_problem.folds, columns @ trial.coefficients, size)
     return np.sqrt(weight)[:, None] * moved

@@ -52,7 +52,7 @@ class Gates:
     false_alarm: float = 0.01  #: largest probability that noise makes one this strong anywhere
     folds_better: float = 0.75  #: least share of folds on which the candidate lowers the error
     explained: float = 0.03  #: least share of the motor's squared residual
-    error_fall: float = 0.02  #: least relative fall of the motor's error on held-out moves
+    error_fall: float = 0.02  #: least relative fall of the motor's error on left-out moves
     # With few moves the bootstrap has little power, and a correct prediction is evidence of another
     # kind.
     strong_folds: float = 0.875  #: as `folds_better`, for a strong candidate

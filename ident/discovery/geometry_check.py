@@ -165,7 +165,7 @@ class _Suspect:
     effects: tuple[PlacedEffect, ...]
     torque_nm: FloatArray  #: their columns at the joints, shape (m, p, r)
     values: FloatArray  #: their coefficients, shape (p,)
-    held_out_fall: float  #: fall of the whitened ‖e‖² on held-out moves
+    left_out_fall: float  #: fall of the whitened ‖e‖² on left-out moves
 
     @classmethod
     def of_pair(cls, problem: SearchProblem, pair: PairOfZeros) -> _Suspect:
@@ -186,14 +186,14 @@ class _Suspect:
 
     def explains_beside(self, problem: SearchProblem, rival_nm: FloatArray) -> bool:
         """Whether it explains most of what it does beside a rival, too."""
-        return explains_beside(problem, self.torque_nm, self.held_out_fall, rival_nm)
+        return explains_beside(problem, self.torque_nm, self.left_out_fall, rival_nm)
 
 
 @dataclass(frozen=True, slots=True)
 class _Rivals:
     """What suspects compete with."""
 
-    findings: tuple[Finding, ...]  #: the best on held-out moves first
+    findings: tuple[Finding, ...]  #: the best on left-out moves first
     at_full_rate: dict[PlacedEffect, FloatArray]  #: columns of those that are not built at the rows
 
     def findings_of(self, effects: Sequence[PlacedEffect]) -> tuple[Finding, ...]:
@@ -221,7 +221,7 @@ class _Rivals:
                 is_fast
                 and found.passed
                 and _is_of_axis(found, delay)
-                and found.held_out_fall > delay.held_out_fall
+                and found.left_out_fall > delay.left_out_fall
             ):
                 return True
         return False
@@ -419,7 +419,7 @@ def _alike(beside: _Round, mistake: Finding) -> tuple[Finding, ...]:
     alike = [mistake]
     for other in others:
         torque_nm = beside.problem.torque_at_rows(other.effect, other.axis)
-        suspect = _Suspect((other.placed,), torque_nm, other.coefficients, other.held_out_fall)
+        suspect = _Suspect((other.placed,), torque_nm, other.coefficients, other.left_out_fall)
         settled = _settled(beside.evidence, suspect, (other,))
         alike.append(other if settled is None else settled.mistakes[0])
     return tuple(alike)
@@ -431,7 +431,7 @@ def _suspects(
     of_currents: Sequence[FamilyTrials],
     rates_nm_s: FloatArray,
 ) -> tuple[_Suspect, ...]:
-    """The mistakes that pass, the best on held-out moves first.
+    """The mistakes that pass, the best on left-out moves first.
 
     Late currents are one suspect, whichever of them pass. They are one as well where a late
     position does alone: the delays of several currents, of which none passes alone, look like it.
@@ -445,15 +445,15 @@ def _suspects(
         if not isinstance(found.effect, Delay):
             torque_nm = problem.torque_at_rows(found.effect, found.axis)
             suspects.append(
-                _Suspect((found.placed,), torque_nm, found.coefficients, found.held_out_fall)
+                _Suspect((found.placed,), torque_nm, found.coefficients, found.left_out_fall)
             )
     if any(isinstance(found.effect, CLOCK) for found in passed):
         late = find_late_currents(problem, of_currents, rates_nm_s)
         if late is not None:
             before = float(problem.folds.square_sum(problem.folds.residual).sum())
-            fall = before - float(late.held_out.sum())
+            fall = before - float(late.left_out.sum())
             suspects.append(_Suspect(late.effects, late.torque_nm, late.seconds, fall))
-    return tuple(sorted(suspects, key=lambda one: -one.held_out_fall))
+    return tuple(sorted(suspects, key=lambda one: -one.left_out_fall))
 
 
 def _rivals(
@@ -529,7 +529,7 @@ def _stands_beside(
     """
     others = rivals.others(suspect)
     best = others[0]
-    is_best = suspect.held_out_fall >= best.held_out_fall
+    is_best = suspect.left_out_fall >= best.left_out_fall
     if not is_best and not suspect.explains_beside(problem, rivals.torque_nm(problem, best)):
         return False
     if any(rivals.has_better_fast(found) for found in own):
@@ -538,9 +538,9 @@ def _stands_beside(
         return True
     for index, found in enumerate(own):
         of_axis = [other for other in others if _is_of_axis(other, found)]
-        if of_axis and of_axis[0].held_out_fall > found.held_out_fall:
+        if of_axis and of_axis[0].left_out_fall > found.left_out_fall:
             alone = replace(
-                suspect, torque_nm=suspect.torque_nm[:, [index]], held_out_fall=found.held_out_fall
+                suspect, torque_nm=suspect.torque_nm[:, [index]], left_out_fall=found.left_out_fall
             )
             if not alone.explains_beside(problem, rivals.torque_nm(problem, of_axis[0])):
                 return False

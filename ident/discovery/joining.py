@@ -195,15 +195,15 @@ def refuted_by_structure(
         by_name, by_term, by_both = score_candidates(folds, np.hstack((own, free)), parts)
         if by_name is None or by_term is None or by_both is None:
             continue
-        left = by_name.held_out.sum(axis=1)
-        beside = by_both.held_out.sum(axis=1)
+        left = by_name.left_out.sum(axis=1)
+        beside = by_both.left_out.sum(axis=1)
         again = replace(
             found,
             coefficients=by_name.coefficients,
             fold_errors=left,
-            held_out_fall=before - float(left.sum()),
+            left_out_fall=before - float(left.sum()),
         )
-        adds_to_term = is_better(beside, by_term.held_out.sum(axis=1))
+        adds_to_term = is_better(beside, by_term.left_out.sum(axis=1))
         if not adds_to_term and is_inadequate(again, term) and (moved := _moved_by(model, again)):
             return SetAside(found, "{rival} explains clearly more", term.placed, moved)
     return None
@@ -409,7 +409,7 @@ def beside_others(
     model: JointFit, placed: PlacedEffect, rng: np.random.Generator, gates: Gates
 ) -> tuple[float, str]:
     """Judge an effect of a joint fit beside all others:
-    fall of ‖e‖² on held-out moves, and why it does not pass.
+    fall of ‖e‖² on left-out moves, and why it does not pass.
     """
     is_delay = isinstance(placed.effect, Delay | LatePosition)
     limits = gates
@@ -456,7 +456,7 @@ def beside_others(
         drives,
         PartsLeftOut.of(problem).refusal(columns),
     )
-    return finding.held_out_fall, "; ".join(dict.fromkeys(reason for reason in reasons if reason))
+    return finding.left_out_fall, "; ".join(dict.fromkeys(reason for reason in reasons if reason))
 
 
 def _uncertain_delay(

@@ -38,7 +38,7 @@ class LateCurrents:
     effects: tuple[PlacedEffect, ...]  #: a time skew, or a lag of each motor whose current is late
     torque_nm: FloatArray  #: their columns at the joints, shape (m, p, r)
     seconds: FloatArray  #: the delays, shape (p,)
-    held_out: FloatArray  #: ‖e‖² of each fold with them, shape (folds,)
+    left_out: FloatArray  #: ‖e‖² of each fold with them, shape (folds,)
 
 
 def rough_torque_rates(evidence: Evidence) -> FloatArray:
@@ -133,7 +133,7 @@ def find_late_currents(
             effects=(placed,),
             torque_nm=delay_columns(problem, placed, rates_nm_s),
             seconds=of_skew.coefficients,
-            held_out=of_skew.held_out.sum(axis=1),
+            left_out=of_skew.left_out.sum(axis=1),
         )
     late = np.flatnonzero(certain_delays(seconds, trial.deviations))
     if not len(late):
@@ -146,7 +146,7 @@ def find_late_currents(
         effects=tuple(lags[index] for index in late),
         torque_nm=own,
         seconds=of_late.coefficients,
-        held_out=of_late.held_out.sum(axis=1),
+        left_out=of_late.left_out.sum(axis=1),
     )
 
 

@@ -79,7 +79,7 @@ PIECES_PER_EFFECT = 3
 class Step:
     """One turn of the loop: the findings, and the model after it."""
 
-    findings: tuple[Finding, ...]  #: named effects on all axes, the best on held-out moves first
+    findings: tuple[Finding, ...]  #: named effects on all axes, the best on left-out moves first
     #: Smooth and periodic terms: on the axis of the best named effect, which must not be much worse
     #: than they are, or on all axes where no named effect passed.
     structures: tuple[Finding, ...]
@@ -139,11 +139,11 @@ def find_effects(
     1. proposes settings (`propose_orders`, `propose_resonances`) and tests every family on every
        axis: its columns, made from the motion and the predicted load and current, are projected off
        all declared directions, and the fall of the squared residual is measured in-sample and on
-       held-out moves (`rank_effects`);
+       left-out moves (`rank_effects`);
     2. passes a candidate only through all gates: larger than noise makes anywhere in the search,
        better on most folds, large enough to matter, and physically possible (`Gates`,
        `impossible`);
-    3. chooses the best on held-out moves, the simplest among equals (`choose_effect`), if it lowers
+    3. chooses the best on left-out moves, the simplest among equals (`choose_effect`), if it lowers
        the error on runs or regions of the workspace left out, and raises it there on no motor
        (`PartsLeftOut`);
     4. tests terms without a name, splines and motor harmonics, on the same axis, or on all axes if

@@ -39,10 +39,10 @@ class PairOfZeros:
         return first.axis, second.axis
 
     def fall(self, problem: SearchProblem) -> FloatArray:
-        """Fall of ‖e‖² on each fold of held-out moves, shape (folds,)."""
+        """Fall of ‖e‖² on each fold of left-out moves, shape (folds,)."""
         folds = problem.folds
         before = folds.square_sum(folds.residual).sum(axis=1)
-        after = self.trial.held_out.sum(axis=1)
+        after = self.trial.left_out.sum(axis=1)
         return np.asarray(before - after)
 
 
@@ -77,7 +77,7 @@ def try_pairs(problem: SearchProblem, tested: Sequence[FamilyTrials]) -> tuple[P
 def pairs_that_pass(
     problem: SearchProblem, pairs: Sequence[PairOfZeros], rng: np.random.Generator, gates: Gates
 ) -> tuple[PairOfZeros, ...]:
-    """Return the pairs of which both zeros are wrong, the best on held-out moves first.
+    """Return the pairs of which both zeros are wrong, the best on left-out moves first.
 
     Args:
         problem: that they were tried on.

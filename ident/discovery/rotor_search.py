@@ -150,7 +150,7 @@ def without_rotor(
             break
     found = effect.with_settings({"rotor_inertia_kg_m2": inertia_kg_m2})
     (trial,) = search_problem.trials([search_problem.torque_at_rows(found, axis)])
-    if trial is None or trial.held_out.sum() >= plain.held_out.sum():
+    if trial is None or trial.left_out.sum() >= plain.left_out.sum():
         return None
     return found
 

@@ -9,15 +9,15 @@ pass every gate:
    model already competes on the other axes with itself alone. Corrections of the geometry compete
    among themselves, too. The smaller probability counts, so that this gate alone lets noise pass in
    up to two or three times 1 % (5 %) of all searches: `rank_families`;
-2. it lowers the error on at least three quarters of the folds of held-out moves;
+2. it lowers the error on at least three quarters of the folds of left-out moves;
 3. it explains at least 3 % of the squared residual of the motor that it affects most;
-4. that motor's error on held-out moves falls by at least 2 %;
+4. that motor's error on left-out moves falls by at least 2 %;
 5. its coefficients are possible: none is outside what physics allows by more than 2 σ, and no time
    constant is longer than the data.
 
 Effects that are to join must pass further gates: see `ident.discovery.gates`.
 
-Candidates are ranked by held-out moves, and the setting of a family (its exponent, its speed) is
+Candidates are ranked by left-out moves, and the setting of a family (its exponent, its speed) is
 chosen anew inside each fold, by the other folds alone: the score of a family has not seen what it
 is scored on.
 
@@ -52,7 +52,7 @@ from ident.effects.position import AlongTwoJoints, Compensator, Counterbalance, 
 
 EffectKey = tuple[str, int, tuple[float, ...]]
 
-AS_GOOD = 0.99  #: Share of the best one's fall on held-out moves that counts as equal
+AS_GOOD = 0.99  #: Share of the best one's fall on left-out moves that counts as equal
 CABLE_MORE = 0.15
 """Share by which a cable over two joints must explain more than a spring,
 a hinge or a compensator of one of them.
@@ -82,15 +82,15 @@ class Finding:
     probability: float | None
     folds_better: float  #: share of folds on which it lowers the error
     explained: float  #: share of the squared residual of the motor that it affects most
-    #: error of that motor on held-out moves without it, ‖e‖/‖v‖ of the current [%]
+    #: error of that motor on left-out moves without it, ‖e‖/‖v‖ of the current [%]
     error_before_percent: float
     error_after_percent: float  #: the same with it [%]
     error_fall: float  #: relative fall from one to the other
-    held_out_fall: float  #: fall of the whole whitened ‖e‖² on held-out moves; the rank
+    left_out_fall: float  #: fall of the whole whitened ‖e‖² on left-out moves; the rank
     passed: bool  #: whether it passes every gate
     #: ‖e‖² of the whole on each fold, shape (folds,), for paired comparisons
     fold_errors: FloatArray
-    #: Other effects that cannot be distinguished from this one by their score on held-out moves.
+    #: Other effects that cannot be distinguished from this one by their score on left-out moves.
     ambiguity: tuple[PlacedEffect, ...] = ()
     #: Of the motor's squared residual beyond noise, roughly: the noise is an estimate, often from
     #: standstill. None where it is not known, or nothing is left beyond it. No gate uses it.
@@ -115,7 +115,7 @@ def rank_effects(
     proposed: Mapping[int, tuple[tuple[Effect, ...], ...]] | None = None,
     known: Collection[str] = (),
 ) -> tuple[Finding, ...]:
-    """Test all families on all axes and rank them, the best on held-out moves first.
+    """Test all families on all axes and rank them, the best on left-out moves first.
 
     Without families, these are those of the dictionary and of installed packages.
 
@@ -156,7 +156,7 @@ def rank_families(
     gates: Gates,
     known: Collection[str] = (),
 ) -> tuple[Finding, ...]:
-    """Judge each family by the gates, and rank them by held-out moves.
+    """Judge each family by the gates, and rank them by left-out moves.
 
     Args:
         search_problem: around the model.
@@ -166,7 +166,7 @@ def rank_families(
         known: names of effects in the model. Families of these names compete among themselves as
             well, and the smaller of both probabilities counts. So do the corrections of the
             geometry, because they are few beside hundreds of other candidates. They have no other
-            precedence: `choose_effect` takes what lowers the error of held-out moves most.
+            precedence: `choose_effect` takes what lowers the error of left-out moves most.
 
     The level of the smaller probability is not that of one. 2000 draws of noise with 60 moves,
     heteroscedastic, and 100 independent candidates, of which 14 are corrections and 12 of known
@@ -194,7 +194,7 @@ def rank_families(
     probabilities = iter(probability)
     sizes = MotorSizes.of(search_problem)
     findings = [_judge(search_problem, sizes, family, probabilities, gates) for family in tested]
-    ranked = sorted(findings, key=lambda finding: -finding.held_out_fall)
+    ranked = sorted(findings, key=lambda finding: -finding.left_out_fall)
     return _with_rivals(ranked)
 
 
@@ -204,7 +204,7 @@ def _with_rivals(ranked: Sequence[Finding]) -> tuple[Finding, ...]:
     better = is_better(errors[:, None], errors[None])
     oneself = np.eye(len(ranked), dtype=np.bool_)
     rivals = ~(better | better.T | oneself)
-    rivals &= np.array([finding.held_out_fall > 0 for finding in ranked])
+    rivals &= np.array([finding.left_out_fall > 0 for finding in ranked])
     places = [finding.placed for finding in ranked]
     compared: list[Finding] = []
     for finding, is_rival in zip(ranked, rivals, strict=True):
@@ -240,7 +240,7 @@ def _is_as_good(finding: Finding, best: Finding) -> bool:
     """Whether an effect on the same axis explains as much as the best one."""
     if finding.axis != best.axis:
         return False
-    if finding.held_out_fall < AS_GOOD * best.held_out_fall:
+    if finding.left_out_fall < AS_GOOD * best.left_out_fall:
         return False
     if not best.effect.refined:
         return True
@@ -254,7 +254,7 @@ def _is_simpler_than_cable(found: Finding, cable: Finding) -> bool:
     second_axis = (cable.effect.second_axis or 0) - 1
     if found.axis not in (cable.axis, second_axis):
         return False
-    return cable.held_out_fall < (1.0 + CABLE_MORE) * found.held_out_fall
+    return cable.left_out_fall < (1.0 + CABLE_MORE) * found.left_out_fall
 
 
 def effect_key(effect: Effect, axis: int) -> EffectKey:
@@ -327,7 +327,7 @@ def refine_setting(
 class MotorSizes:
     """What all candidates of a turn are compared with."""
 
-    before: FloatArray  #: ‖e‖² of each fold and motor on held-out moves, shape (folds, m)
+    before: FloatArray  #: ‖e‖² of each fold and motor on left-out moves, shape (folds, m)
     residual: FloatArray  #: ‖e‖² of each motor, shape (m,)
     current: FloatArray  #: ‖v‖² of each motor, shape (m,)
 
@@ -390,7 +390,7 @@ def _judge(
         error_before_percent=100.0 * error_before,
         error_after_percent=100.0 * error_after,
         error_fall=1.0 - error_after / error_before,
-        held_out_fall=float(fall.sum()),
+        left_out_fall=float(fall.sum()),
         passed=True,
         share_of_excess=_share_of_excess(search_problem, sizes, trial, motor),
         fold_errors=after.sum(axis=1),
@@ -437,7 +437,7 @@ def _with_refusals(finding: Finding, trial: CandidateTrial, gates: Gates) -> Fin
     if finding.error_fall < gates.error_fall and not may_be_small:
         percent = -100 * finding.error_fall
         refusals.append(f"the error on left-out moves changes by {percent:+.1f} % only")
-    if finding.held_out_fall <= 0.0:
+    if finding.left_out_fall <= 0.0:
         refusals.append("the error on left-out moves does not fall")
     if finding.impossible:
         refusals.append(finding.impossible)

@@ -45,7 +45,7 @@ where a spline would rest on a handful of them.
 def find_structure(
     search_problem: SearchProblem, axes: Iterable[int], rng: np.random.Generator, gates: Gates
 ) -> tuple[Finding, ...]:
-    """Find variables that the residual of some axes depends on, ranked by held-out moves."""
+    """Find variables that the residual of some axes depends on, ranked by left-out moves."""
     if search_problem.folds.moves < MIN_MOVES_FOR_STRUCTURE:
         return ()  # a term of many coefficients would fit the few moves
     tested: list[FamilyTrials] = []
@@ -60,7 +60,7 @@ def is_inadequate(named: Finding, structure: Finding) -> bool:
 
     Then the true effect is only similar to the named one, and the residual counts as unexplained.
     """
-    explains_much_more = structure.held_out_fall > (1.0 + MUCH_MORE) * named.held_out_fall
+    explains_much_more = structure.left_out_fall > (1.0 + MUCH_MORE) * named.left_out_fall
     if not structure.passed or not explains_much_more:
         return False
     return bool(is_better(structure.fold_errors, named.fold_errors))

@@ -24,7 +24,7 @@ def passed_finding(effect: Effect, axis: int, value: float, std: float) -> Findi
         error_before_percent=5.0,
         error_after_percent=4.0,
         error_fall=0.2,
-        held_out_fall=9.0,
+        left_out_fall=9.0,
         passed=True,
         fold_errors=fold_errors,
     )

@@ -110,7 +110,7 @@ def finding(
         error_before_percent=9.0,
         error_after_percent=6.0,
         error_fall=error_fall,
-        held_out_fall=100.0 if passed else 3.0,
+        left_out_fall=100.0 if passed else 3.0,
         passed=passed,
         fold_errors=fold_errors,
         ambiguity=rivals,
@@ -1027,7 +1027,7 @@ def test_a_small_candidate_on_few_moves_is_named_with_what_to_record(closed: Clo
     impossible = replace(
         untested, axis=2, impossible="coefficient is -1 ± 0.1; physics allows no less than 0"
     )
-    no_help = replace(untested, axis=3, held_out_fall=-1.0)
+    no_help = replace(untested, axis=3, left_out_fall=-1.0)
     few_folds = replace(untested, axis=4, folds_better=0.5)
     tiny = replace(untested, axis=5, explained=0.001)
     first, last = closed.fitted.steps

@@ -91,7 +91,7 @@ def _judged(problem: SearchProblem, *trials: CandidateTrial) -> list[Finding]:
     """Findings of a saturation in the order of the trials,
     which are given the shapes of a robot with three motors.
     """
-    shaped = [replace(one, held_out=np.zeros((8, 3)), fallen=np.ones(3)) for one in trials]
+    shaped = [replace(one, left_out=np.zeros((8, 3)), fallen=np.ones(3)) for one in trials]
     families = [FamilyTrials(0, ((Saturation(), one),)) for one in shaped]
     rng = np.random.default_rng(2)
     ranked = rank_families(problem, families, rng, GATES)

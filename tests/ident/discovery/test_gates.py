@@ -331,7 +331,7 @@ def test_what_only_moves_of_the_same_run_predict_is_refused(
     candidates = (slice(0, powers),)
     (trial,) = score_candidates(problem.folds, columns, candidates)
     assert trial is not None
-    assert trial.held_out.sum() < 0.9 * problem.folds.square_sum(problem.folds.residual).sum()
+    assert trial.left_out.sum() < 0.9 * problem.folds.square_sum(problem.folds.residual).sum()
     assert bool(PartsLeftOut.of(problem).refusal(columns)) == (powers == 3)
 
 
@@ -575,7 +575,7 @@ def test_what_holds_in_one_region_alone_is_refused(small: Evidence) -> None:
     candidates = (slice(0, REGIONS - 1),)
     (trial,) = score_candidates(folds, powers, candidates)
     assert trial is not None
-    assert trial.held_out.sum() < 0.9 * folds.square_sum(folds.residual).sum()
+    assert trial.left_out.sum() < 0.9 * folds.square_sum(folds.residual).sum()
     assert differing.refusal(powers)
 
 

@@ -132,8 +132,8 @@ def test_the_same_seed_gives_the_same_verdict(small: Evidence) -> None:
     first, second = (
         rank_effects(search_problem_of(small), np.random.default_rng(4), GATES) for _ in range(2)
     )
-    expected = [(f.effect, f.axis, f.probability, f.held_out_fall) for f in second]
-    assert [(f.effect, f.axis, f.probability, f.held_out_fall) for f in first] == expected
+    expected = [(f.effect, f.axis, f.probability, f.left_out_fall) for f in second]
+    assert [(f.effect, f.axis, f.probability, f.left_out_fall) for f in first] == expected
 
 
 def test_a_setting_is_chosen_without_the_fold_that_it_is_scored_on(
@@ -144,11 +144,11 @@ def test_a_setting_is_chosen_without_the_fold_that_it_is_scored_on(
     (tested,) = search_problem.test(families, 0)
     scored = tested.nested()
     trials = [trial for _, trial in tested.members]
-    left_out = np.stack([trial.held_out.sum(axis=1) for trial in trials])
+    left_out = np.stack([trial.left_out.sum(axis=1) for trial in trials])
     for fold in range(search_problem.folds.count):
         chosen = max(range(len(trials)), key=lambda index: trials[index].training_fall[fold])
-        held_out = trials[chosen].held_out
-        assert np.array_equal(scored[fold], held_out[fold])
+        squares = trials[chosen].left_out
+        assert np.array_equal(scored[fold], squares[fold])
     # Among twelve settings that mean nothing, the best of each fold looks like an effect.
     before = search_problem.folds.square_sum(search_problem.folds.residual).sum()
     smallest_left_out = left_out.min(axis=0)
@@ -247,13 +247,13 @@ def _noise_trial(
     coefficients = np.linalg.solve(gram.sum(axis=0), score.sum(axis=0))
     fallen = np.array([float(score.sum(axis=0) @ coefficients)])
     scatter = score - gram @ coefficients
-    held_out = np.zeros((8, 1))
+    left_out = np.zeros((8, 1))
     training_fall = np.zeros(8)
     return CandidateTrial(
         coefficients=coefficients,
         fallen=fallen,
         training_fall=training_fall,
-        held_out=held_out,
+        left_out=left_out,
         score=score.sum(axis=0),
         scatter=scatter,
         gram=gram,
@@ -273,7 +273,7 @@ def test_the_bootstrap_keeps_its_size(
     false = 0
     for _ in range(400):
         trial = replace(
-            _noise_trial(rng, moves, columns), held_out=np.zeros((8, 3)), fallen=np.ones(3)
+            _noise_trial(rng, moves, columns), left_out=np.zeros((8, 3)), fallen=np.ones(3)
         )
         members = ((effect, trial),)
         tested = [FamilyTrials(0, members)]

@@ -99,7 +99,7 @@ def _finding(effect: Effect, fall: float, axis: int = 1, *, passed: bool = True)
         error_before_percent=5.0,
         error_after_percent=4.0,
         error_fall=0.2,
-        held_out_fall=fall,
+        left_out_fall=fall,
         passed=passed,
         fold_errors=fold_errors,
     )

@@ -48,12 +48,12 @@ def _written_out(problem: Linearisation, columns: FloatArray, count: int = 8) ->
     gram = np.stack([left[rows].T @ left[rows] for rows in moves])
     score = left.T @ e
     training_fall = np.array(training)
-    held_out = np.array(held)
+    left_out = np.array(held)
     return CandidateTrial(
         coefficients=coefficients,
         fallen=fallen,
         training_fall=training_fall,
-        held_out=held_out,
+        left_out=left_out,
         score=score,
         scatter=scatter,
         gram=gram,
@@ -110,8 +110,8 @@ def test_a_column_that_one_fold_alone_sees_predicts_nothing_there() -> None:
     assert trial is not None
     expected = _written_out(problem, seen)  # of the least size, where the others do not say: zero
     assert trial.training_fall[3] == pytest.approx(0.0, abs=1e-9)
-    assert trial.held_out == pytest.approx(expected.held_out, rel=1e-6)
-    assert trial.held_out[3] == pytest.approx(folds.square_sum(folds.residual)[3])
+    assert trial.left_out == pytest.approx(expected.left_out, rel=1e-6)
+    assert trial.left_out[3] == pytest.approx(folds.square_sum(folds.residual)[3])
 
 
 def test_pairs_of_which_one_fold_alone_sees_a_part_predict_with_the_other() -> None:
@@ -124,7 +124,7 @@ def test_pairs_of_which_one_fold_alone_sees_a_part_predict_with_the_other() -> N
     candidates = [slice(0, 2)]
     (trial,) = score_candidates(folds, pair, candidates)
     assert trial is not None
-    assert trial.held_out == pytest.approx(_written_out(problem, pair).held_out, rel=1e-6)
+    assert trial.left_out == pytest.approx(_written_out(problem, pair).left_out, rel=1e-6)
 
 
 def test_the_unit_of_a_candidate_does_not_matter() -> None:
