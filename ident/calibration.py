@@ -111,7 +111,7 @@ class AcceptedEffect:
     package: str | None = None
 
     @property
-    def is_confirmed(self) -> bool:
+    def is_harmless(self) -> bool:
         """Whether it does not raise the error on unseen data by more than SAME_ERROR of it."""
         return self.error_after_percent <= (1.0 + SAME_ERROR) * self.error_before_percent
 

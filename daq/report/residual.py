@@ -451,7 +451,7 @@ def _to_be_refused(effects: Sequence[AcceptedEffect]) -> Iterator[str]:
     """Name the effects with which `apply` refuses a calibration
     (`daq.writeback.gates.fit.effect`).
     """
-    refused = [one for one in effects if not one.is_confirmed]
+    refused = [one for one in effects if not one.is_harmless]
     errors = [
         f"{one.error_after_percent:.2f} % with it, {one.error_before_percent:.2f} % without"
         for one in refused

@@ -90,7 +90,7 @@ from ident.estimators.estimate import Estimate, Identification
 from ident.estimators.geometry_estimate import GeometryFinding
 from ident.estimators.identify import estimate_with
 from ident.estimators.method import Method
-from ident.estimators.turned_geometry import GEOMETRY, find_turned_geometry, is_confirmed
+from ident.estimators.turned_geometry import GEOMETRY, find_turned_geometry, fits_better
 from ident.geometry_drift import GeometryDrift
 from ident.model.model import Model
 from ident.model.robot import JointKind, Robot
@@ -260,7 +260,7 @@ def turned_geometry(
     if corrected is not None and find_turned_geometry(corrected, rows, nameplate) is None:
         return None
     turned = find_turned_geometry(model, rows, nameplate)
-    if turned is None or not is_confirmed(
+    if turned is None or not fits_better(
         turned,
         model,
         recordings.runs(),

@@ -716,10 +716,10 @@ def _moved(gravity: FloatArray, step: FloatArray) -> FloatArray:
     return np.asarray(size * direction / np.linalg.norm(direction))
 
 
-# Confirmation
+# A fit of all rows in another geometry
 
 
-def is_confirmed(
+def fits_better(
     geometry: TurnedGeometry,
     model: Model,
     runs: Iterable[Run],

@@ -29,7 +29,7 @@ from ident.estimators.diagnosis import diagnose, exchanged_channels, unsigned_ch
 from ident.estimators.estimate import Identification
 from ident.estimators.identify import identify
 from ident.estimators.method import Method
-from ident.estimators.turned_geometry import find_turned_geometry, is_confirmed, with_gravity
+from ident.estimators.turned_geometry import find_turned_geometry, fits_better, with_gravity
 from tests.ident.mistaken import AXES, BODY, SMALL, small_recordings, turned, with_currents
 from tests.ident.recordings import FloatArray, Truth, three_axes_truth
 from tests.studies.planted_mistakes import late
@@ -81,7 +81,7 @@ def named(
         names.append(type(error).__name__)
     instants = read_instants(truth.model, runs, SMALL)
     turned = find_turned_geometry(truth.model, instants, gains)
-    if turned is not None and is_confirmed(
+    if turned is not None and fits_better(
         turned, truth.model, runs, SMALL, gains, gains_fixed=fixed, before_percent=error_percent
     ):
         one = turned.diagnosis(AXES)

@@ -71,13 +71,13 @@ def test_the_document_has_the_verdict() -> None:
 
 
 @pytest.mark.parametrize(
-    ("after", "confirmed"), [(5.76, True), (5.81, True), (5.83, False), (4.0, True)]
+    ("after", "harmless"), [(5.76, True), (5.81, True), (5.83, False), (4.0, True)]
 )
 def test_the_write_back_refuses_no_effect_for_less_than_a_hundredth(
-    after: float, confirmed: bool
+    after: float, harmless: bool
 ) -> None:
     accepted_effect = AcceptedEffect("spring", "J2", {}, (), 5.76, after)
-    assert accepted_effect.is_confirmed == confirmed
+    assert accepted_effect.is_harmless == harmless
 
 
 def test_the_options_choose_what_joins() -> None:

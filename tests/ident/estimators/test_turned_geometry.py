@@ -18,8 +18,8 @@ from ident.estimators.turned_geometry import (
     ZERO_TURNED,
     TurnedGeometry,
     find_turned_geometry,
+    fits_better,
     gravity_products,
-    is_confirmed,
     with_gravity,
 )
 from tests.ident.mistaken import AXES, SMALL, small_recordings, with_currents
@@ -243,7 +243,7 @@ def test_a_fit_of_all_rows_confirms_it(truth: Truth, clean: list[Run], gains_fix
     assert found is not None
 
     def confirmed(before_percent: float | None) -> bool:
-        return is_confirmed(
+        return fits_better(
             found,
             wall.model,
             clean,
