@@ -516,7 +516,7 @@ def _payload_masses(
 
 
 def factor_of(covariance: FloatArray) -> tuple[tuple[float, ...], ...] | None:
-    """Rows of L with the covariance L Lᵀ, to six digits; None where σ is not finite.
+    """Rows of L with the covariance L Lᵀ, shape (u, u), to six digits; None where σ is not finite.
 
     Unlike Cholesky's factor, it exists with fewer moves than unknowns too.
     """

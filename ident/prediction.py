@@ -118,7 +118,7 @@ def corrections_of(calibration: Calibration) -> tuple[PlacedEffect, ...]:
 
 
 def left_of(placed: PlacedEffect, coefficients: FloatArray) -> tuple[PlacedEffect, FloatArray]:
-    """An effect and its coefficients in a corrected model: of a correction only its σ."""
+    """An effect and its coefficients, (p,), in a corrected model: of a correction only its σ."""
     if not isinstance(placed.effect, GeometryEffect):
         return placed, coefficients
     applied = placed.effect.with_applied(coefficients.tolist())
@@ -185,7 +185,8 @@ def measured_torque(
 def measured_current(
     calibration: Calibration, model: Model, current_a: FloatArray, motion: Motion
 ) -> FloatArray:
-    """Return the part of current references that is predicted: all but internal preload.
+    """Return the part of current references [A], shape (k, m), that is predicted: all but internal
+    preload.
 
     Arguments and errors are those of `measured_torque`.
     """

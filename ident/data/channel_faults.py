@@ -156,7 +156,7 @@ class JudgedChannels:
     faults: tuple[ChannelFault, ...]
 
     def answers_for(self, position: object, current: object, ratio: FloatArray) -> bool:
-        """Whether these are the arrays that were judged, not copies of them."""
+        """Whether these are the arrays that were judged, not copies; the ratio is (m, m)."""
         are_same_arrays = position is self.position and current is self.current
         return are_same_arrays and np.array_equal(ratio, self.ratio)
 

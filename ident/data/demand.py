@@ -61,7 +61,9 @@ class Demands:
         self._found: dict[int, tuple[Dataset, FloatArray | None]] = {}
 
     def of(self, data: Dataset, drive_train: DriveTrain) -> FloatArray | None:
-        """Return `demanded_positions` of a run, computed once for each `Dataset` object."""
+        """Return `demanded_positions` of a run, shape (k, n), computed once for each `Dataset`
+        object.
+        """
         key = id(data)
         if key not in self._found:
             self._found[key] = (data, demanded_positions(data, drive_train))

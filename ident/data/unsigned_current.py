@@ -60,7 +60,7 @@ def require_signed_currents(run: Run, ratio: FloatArray, axes: Sequence[str]) ->
 
 
 def missing_sign(current: FloatArray) -> str:
-    """Return the sign that currents of one sign do not have, in words."""
+    """Return the sign that currents of one sign, shape (k,), do not have, in words."""
     if current.max() > 0.0:
         return "negative"
     return "positive"
@@ -178,8 +178,8 @@ def rise_ratio(size: FloatArray, visits: IntArray, time_s: FloatArray, rise: flo
 
 
 def median_rise(size: FloatArray, visits: IntArray, lag: int) -> float:
-    """Median over the visits of the mean current, lag samples before and after,
-    less that of the visit.
+    """Median over the visits of the mean size of the current, shape (k,), lag samples before and
+    after, less that of the visit.
     """
     around = 0.5 * (size[visits - lag] + size[visits + lag])
     return float(np.median(around - size[visits]))

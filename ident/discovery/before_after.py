@@ -213,6 +213,8 @@ class RunErrors:
 def left_out_runs(evidence: Evidence, weights_nm_a: FloatArray) -> RunErrors:
     """Refit everything without each run of the fit in turn, and predict that run.
 
+    Motors count by weights_nm_a, shape (m,).
+
     The only run with the known payload, or the only one without, cannot be left out: it is listed
     with the reason.
     """
@@ -473,6 +475,8 @@ def assess(
     evidence: Evidence, weights_nm_a: FloatArray, left_out: RunErrors | None = None
 ) -> Assessment:
     """Compute the errors and gains of one model, identified by ``ml``.
+
+    Motors count by weights_nm_a, shape (m,).
 
     Raises:
         TooFewMoves: there are too few moves to leave some out.

@@ -133,7 +133,10 @@ class SearchProblem:
         return _scored(self.folds, self._felt(torques))
 
     def fits(self, torques: Iterable[FloatArray]) -> tuple[CandidateFit | None, ...]:
-        """Fit candidates as `trials` has them to all rows, without folds: a tenth of the time."""
+        """Fit candidates given by joint torques (m, p, r) to all rows, without folds.
+
+        It takes a tenth of the time.
+        """
         return fit_candidates(self.folds, self._felt(torques))
 
     def fits_at_rows(
@@ -191,7 +194,10 @@ class SearchProblem:
         return at_joints(effect, axis, kept.astype(np.float64), self.model.drive_train)
 
     def torque_at_rows(self, effect: Effect, axis: int) -> FloatArray:
-        """Build the same from signals at the rows: fast, good for effects that change slowly."""
+        """Build the same, shape (m, p, r), from signals at the rows.
+
+        It is fast, and good for effects that change slowly.
+        """
         if effect.abscissa in FAST:
             return self.torque(effect, axis)
         conditioning = self.observation.conditioning
@@ -348,7 +354,7 @@ def _signals_at_rows(run: Signals, data: Dataset, conditioning: Conditioning) ->
 def folds_around(
     model: Model, observation: Observation, estimate: Estimate
 ) -> tuple[Folds, FloatArray]:
-    """Return the problem around an estimate in folds, and the step to its best fit.
+    """Return the problem around an estimate in folds, and the step to its best fit, shape (u,).
 
     Friction differs from run to run in it.
 

@@ -73,7 +73,9 @@ class Gates:
 def impossible(
     columns: Sequence[Column], values: FloatArray, deviations: FloatArray, tolerance: float = SIGMAS
 ) -> str:
-    """Name the coefficients outside their possible values by a number of σ; empty without any."""
+    """Name the coefficients, shape (p,), outside their possible values by a number of σ, (p,);
+    empty without any.
+    """
     found: list[str] = []
     for column, value, std in zip(columns, values, deviations, strict=True):
         if value < column.least - tolerance * std:
@@ -341,7 +343,10 @@ class PartsLeftOut:
         )
 
     def refusal(self, columns: FloatArray) -> str:
-        """Why whitened columns may not join; empty where they may, or nothing can be left out."""
+        """Why whitened columns, (rows, p), may not join.
+
+        Empty where they may, or nothing can be left out.
+        """
         if not self.others:
             return ""
         change = self.change(columns)
@@ -475,7 +480,9 @@ def shifts_by(folds: Folds, torque: FloatArray, size: int) -> FloatArray:
 
 
 def moved_gains(shifts: FloatArray, gains_std: FloatArray) -> tuple[tuple[int, float], ...]:
-    """Index of each gain that moves by more than its σ, and by how many; fixed gains never move."""
+    """Index of each gain that moves by more than its σ, and by how many of them; shifts and σ have
+    shape (m,). Fixed gains never move.
+    """
     sigmas = np.zeros_like(shifts)
     np.divide(np.abs(shifts), gains_std, where=gains_std > 0.0, out=sigmas)
     return tuple((motor, size) for motor, size in enumerate(sigmas.tolist()) if size > 1.0)

@@ -109,7 +109,7 @@ def _estimated(
 
 
 def with_geometry_covariance(found: Identification, covariance: FloatArray) -> Identification:
-    """Add the uncertainty of the geometry to an estimate without effects."""
+    """Add the uncertainty of the geometry, shape (m + p, m + p), to an estimate without effects."""
     estimate = found.estimate
     return replace(found, estimate=replace(estimate, covariance=estimate.covariance + covariance))
 

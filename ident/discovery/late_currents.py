@@ -82,7 +82,7 @@ def delay_columns(
     Args:
         problem: around the fit.
         placed: a lag or a time skew, without a filter.
-        rates_nm_s: from `torque_rates`.
+        rates_nm_s: from `torque_rates`, shape (m, r).
     """
     if isinstance(placed.effect, TimeSkew):
         columns = -rates_nm_s[:, None]
@@ -92,7 +92,12 @@ def delay_columns(
 
 
 def try_delays(problem: SearchProblem, rates_nm_s: FloatArray) -> tuple[FamilyTrials, ...]:
-    """Trials of the delay of each current alone, and of all currents alike."""
+    """Trials of the delay of each current alone, and of all currents alike.
+
+    Args:
+        problem: around the fit.
+        rates_nm_s: from `torque_rates`, shape (m, r).
+    """
     lags = [PlacedEffect(Lag(), axis) for axis in range(problem.axes)]
     placed = [*lags, PlacedEffect(TimeSkew(), 0)]
     trials = problem.trials(delay_columns(problem, one, rates_nm_s) for one in placed)
@@ -111,7 +116,7 @@ def find_late_currents(
     Args:
         problem: around the fit.
         tested: from `try_delays`: the delays that the model does not contain.
-        rates_nm_s: from `torque_rates`.
+        rates_nm_s: from `torque_rates`, shape (m, r).
     """
     axes = [family.axis for family in tested if isinstance(family.members[0][0], Lag)]
     lags = tuple(PlacedEffect(Lag(), axis) for axis in axes)

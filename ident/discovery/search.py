@@ -274,7 +274,9 @@ def _parameter_count(effect: Effect) -> int:
 
 
 def is_better(one: FloatArray, other: FloatArray) -> BoolArray:
-    """Whether one ‖e‖² is less than the other by a paired comparison over folds, folds last."""
+    """Whether one ‖e‖² is less than the other by a paired comparison over folds, shape (…, folds):
+    (…,).
+    """
     gain = other - one
     freedom = gain.shape[-1] - 1
     limit = scipy.special.stdtrit(freedom, 0.5 + CLEARLY / 2.0)
@@ -282,7 +284,7 @@ def is_better(one: FloatArray, other: FloatArray) -> BoolArray:
 
 
 def paired_t(gain: FloatArray) -> FloatArray:
-    """Student's t of the fall of ‖e‖² on each fold, folds last."""
+    """Student's t of the fall of ‖e‖² on each fold, shape (…, folds) → (…,)."""
     scatter = np.std(gain, axis=-1, ddof=1)
     error = scatter * np.sqrt(gain.shape[-1])
     return np.asarray(gain.sum(axis=-1) / np.maximum(error, TINY))
@@ -345,7 +347,12 @@ class MotorSizes:
         return cls(before, residual, current)
 
     def relative_error(self, squares: FloatArray, motor: int) -> float:
-        """Error of a motor of which ‖e‖² is given by fold and motor, ‖e‖/‖v‖ of the current."""
+        """Error of a motor, ‖e‖/‖v‖ of its current.
+
+        Args:
+            squares: ‖e‖² of each fold and motor, shape (folds, m).
+            motor: index of it.
+        """
         left = squares[:, motor].sum()
         return float(np.sqrt(left / float(self.current[motor])))
 
@@ -496,7 +503,7 @@ def _ruled_out(effect: Effect, trial: CandidateTrial, fewest: int) -> str:
 
 
 def chances(trials: tuple[CandidateTrial, ...], rng: np.random.Generator, draws: int) -> FloatArray:
-    """Probability of each candidate's Wald statistic under random signs of the moves.
+    """Probability of each candidate's Wald statistic under random signs of the moves, shape (n,).
 
     It is that the largest statistic of all candidates is as large.
 

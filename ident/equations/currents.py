@@ -137,7 +137,13 @@ class Currents:
         return np.asarray(np.sqrt(square_sum / freedom))
 
     def cost(self, gains: FloatArray, parameters: FloatArray, noise: FloatArray) -> float:
-        """Cost of an estimate, Σ r_i log ‖e_i‖ at the best σ_i; with preload for this σ."""
+        """Cost of an estimate, Σ r_i log ‖e_i‖ at the best σ_i; with preload for this σ.
+
+        Args:
+            gains: shape (m,).
+            parameters: shape (p,).
+            noise: σ of each current [A], shape (m,); used with preload alone.
+        """
         del noise
         std = self.noise(gains, parameters)
         size = std * np.sqrt(np.maximum(self.rows, 1.0))
@@ -190,7 +196,12 @@ class PreloadedCurrents(Currents):
         return whitening_transform(self.preload, gains, noise)
 
     def whitened(self, gains: FloatArray, noise: FloatArray) -> Currents:
-        """Take the most likely preload out of the rows."""
+        """Take the most likely preload out of the rows.
+
+        Args:
+            gains: shape (m,).
+            noise: σ of each current [A], shape (m,).
+        """
         transform = self.transform(gains, noise)
         count = len(gains)
 
@@ -211,7 +222,14 @@ class PreloadedCurrents(Currents):
     def corrected(
         self, gains: FloatArray, noise: FloatArray, whitened: Currents, residual: FloatArray
     ) -> FloatArray:
-        """Take the corrections σ e out of the measured currents."""
+        """Take the corrections σ e out of the measured currents: drive columns, shape (m r, m).
+
+        Args:
+            gains: shape (m,).
+            noise: σ of each current [A], shape (m,).
+            whitened: the rows without preload.
+            residual: e, of the rows of one motor after the other, shape (m r,).
+        """
         of_motors = residual.reshape(len(gains), -1)
         corrections = noise[:, None] * of_motors
         transform = self.transform(gains, noise)
@@ -227,7 +245,9 @@ class PreloadedCurrents(Currents):
         free: int = 0,
         before: FloatArray | None = None,
     ) -> FloatArray:
-        """σ of each current from its corrections and the share of its noise that they show, P_ii.
+        """σ of each current [A], shape (m,).
+
+        It follows from its corrections and the share of its noise that they show, P_ii.
 
         The corrections of a motor have only what the preload has left of its noise (variance
         components: Förstner, Allgemeine Vermessungs-Nachrichten 86 (1979)).
@@ -253,7 +273,7 @@ class PreloadedCurrents(Currents):
         return np.asarray(before * np.sqrt(variance_ratio))
 
     def cost(self, gains: FloatArray, parameters: FloatArray, noise: FloatArray) -> float:
-        """½ ‖e‖², for this σ."""
+        """½ ‖e‖², for this σ; arguments as for `Currents.cost`."""
         whitened = self.whitened(gains, noise)
         residual = whitened.residual(gains, parameters)
         return 0.5 * float(residual @ residual)

@@ -154,7 +154,9 @@ class Linearisation:
     def whitened_by_motor(
         self, torque_nm: FloatArray, to_motor: FloatArray
     ) -> dict[int, FloatArray]:
-        """The same with what runs share still in the columns; see `decorrelated_by_motor`."""
+        """The same, (extra, rows), with what runs share still in the columns; see
+        `decorrelated_by_motor`.
+        """
         by_motor: dict[int, FloatArray] = {}
         if self.transform is not None:
             for motor in range(len(self.gamma)):
@@ -273,7 +275,9 @@ def linearise(
     *,
     gains_fixed: bool,
 ) -> Linearisation:
-    """Linearise around given gains [Nm/A], parameters and current noise [A] of each motor."""
+    """Linearise around given gains [Nm/A], (m,), parameters, (p,), and current noise [A] of each
+    motor, (m,).
+    """
     count = len(gains)
     width = count + len(parameters)
     first = 0

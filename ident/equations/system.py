@@ -101,7 +101,7 @@ class GivenUnknowns:
     def joined_in_clusters(
         self, clusters: Sequence[Sequence[FloatArray]], first: int
     ) -> tuple[tuple[FloatArray, ...], ...]:
-        """The same of the rows of each motor in each cluster."""
+        """The same of the rows of each motor in each cluster, shape (r, first + count + 1)."""
         joined: list[tuple[FloatArray, ...]] = []
         for cluster in clusters:
             of_motors = [self.joined_in(rows, first) for rows in cluster]

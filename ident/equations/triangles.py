@@ -35,12 +35,17 @@ class Triangles:
     rows: IntArray  #: number of equations of each axis, shape (m,)
 
     def stacked(self, weight: FloatArray) -> FloatArray:
-        """All axes below each other, each scaled by its weight."""
+        """All axes below each other, each scaled by its weight, (m,): shape (≤m c, c)."""
         pairs = zip(self.factors, weight, strict=True)
         return np.concatenate([factor * scale for factor, scale in pairs])
 
     def residual_std(self, vector: FloatArray, free: int) -> FloatArray:
-        """σ of each axis' residual R x; ``free`` parameters are shared by the axes (eq. 9)."""
+        """σ of each axis' residual R x, shape (m,) (eq. 9).
+
+        Args:
+            vector: x, shape (c,).
+            free: number of estimated parameters, which are shared by the axes.
+        """
         square_sum = self.square_sum(vector)
         share = free / len(self.rows)
         freedom = np.maximum(self.rows - share, 1.0)
@@ -81,7 +86,14 @@ def triangle_of(columns: FloatArray) -> FloatArray:
 
 
 def solve(matrix: FloatArray, right: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Least squares with unit-norm columns inside: solution and (MᵀM)⁻¹.
+    """Least squares with unit-norm columns inside.
+
+    Args:
+        matrix: M, shape (k, c).
+        right: shape (k,).
+
+    Returns:
+        the solution, shape (c,), and (MᵀM)⁻¹, shape (c, c).
 
     Scaling columns changes no least-squares solution, but spares digits where one is in kg and
     another in kg m².
@@ -125,7 +137,7 @@ def least_squares(matrix: FloatArray, right: FloatArray) -> FloatArray:
 
 
 def singular_values(matrix: FloatArray) -> FloatArray:
-    """Singular values in decreasing order."""
+    """Singular values of a matrix in decreasing order, shape (c,)."""
     values = np.linalg.svd(matrix, compute_uv=False)
     return np.asarray(values, dtype=np.float64)
 

@@ -227,7 +227,7 @@ def _among_all_unknowns(estimate: Estimate, system: System, kept: list[int]) -> 
 
 
 def relative_std_percent(values: FloatArray, std: FloatArray) -> FloatArray:
-    """100 σ/|χ| (eq. 11) [%]; infinite for a value of zero."""
+    """100 σ/|χ| (eq. 11) [%] of each value, shape (p,); infinite for a value of zero."""
     with np.errstate(divide="ignore", invalid="ignore"):
         percent = 100.0 * std / np.abs(values)
     return np.nan_to_num(percent, nan=np.inf, posinf=np.inf)

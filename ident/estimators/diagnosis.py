@@ -248,7 +248,7 @@ def weight_diagnoses(system: System, estimate: Estimate) -> Iterator[Diagnosis]:
 def gain_diagnoses(
     estimate: Estimate, nameplate: FloatArray, axes: Sequence[str]
 ) -> Iterator[Diagnosis]:
-    """Compare free gains with the nameplate: signs, and sizes outside GAIN_RANGE.
+    """Compare free gains with the nameplate, shape (m,): signs, and sizes outside GAIN_RANGE.
 
     A size is outside by more than GAIN_SIGMAS σ. A gain that the moves hardly show is named as well
     where it may be zero, or where its number is absurd.
@@ -314,7 +314,9 @@ def _gain_off_nameplate(axis: str, evidence: str, nameplate: float) -> Diagnosis
 def outside(
     values: FloatArray, margin: FloatArray | float, bounds: tuple[float, float]
 ) -> BoolArray:
-    """Whether numbers are outside a range by more than a margin; NaN is not."""
+    """Whether each number is outside a range by more than a margin; NaN is not. The result and an
+    array of margins have the shape of the numbers.
+    """
     lowest, highest = bounds
     is_below = values + margin < lowest
     is_above = values - margin > highest
@@ -473,7 +475,9 @@ def axis_error_diagnoses(
 def torque_diagnoses(
     system: System, estimate: Estimate, effort_limit: FloatArray
 ) -> Iterator[Diagnosis]:
-    """Compare the torques with the effort limits of the URDF: a unit puts all of them above."""
+    """Compare the torques with the effort limits of the URDF, shape (m,): a wrong unit puts all of
+    them above.
+    """
     torque, _ = joint_torques(system, estimate)
     has_limit = np.isfinite(effort_limit)
     if not np.any(has_limit):

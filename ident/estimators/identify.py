@@ -365,7 +365,7 @@ def with_signed_currents(
 def estimate_with(
     method: Method, system: System, fixed_gains: FloatArray | None = None
 ) -> Estimate:
-    """Run one estimator by its name.
+    """Run one estimator by its name, with the gains held at ``fixed_gains``, shape (m,), if given.
 
     Raises:
         DataUnfit: ``tls`` with fixed gains: it has nothing to correct then.

@@ -283,7 +283,8 @@ def require_agreeing_masses(system: System, estimate: Estimate) -> None:
 
 
 def require_roles(gains: FloatArray, nameplate: FloatArray) -> None:
-    """Refuse gains that all have the wrong sign: the payload was taken from the wrong runs.
+    """Refuse gains, shape (m,), that all have the sign opposite to the nameplate, (m,): the payload
+    was taken from the wrong runs.
 
     Raises:
         RolesExchanged: every sign is opposite to that of the nameplate.
@@ -397,7 +398,8 @@ def _require_braking_friction(estimate: Estimate) -> None:
 
 
 def require_units(gains: FloatArray, nameplate: FloatArray) -> None:
-    """Refuse gains that are all off the nameplate by a factor that only a unit has.
+    """Refuse gains, shape (m,), that are all off the nameplate, (m,), by a factor that only a unit
+    has.
 
     Raises:
         UnitsMistaken: each is more than UNIT_RATIO times, or less than 1/UNIT_RATIO of, its
@@ -588,5 +590,5 @@ def idle_joints(model: Model, size: FloatArray, left: FloatArray) -> BoolArray:
 
 
 def numbers_text(values: FloatArray) -> str:
-    """Write numbers for a message, with three digits."""
+    """Write numbers, shape (k,), for a message, with three digits."""
     return ", ".join(f"{value:.3g}" for value in values)

@@ -279,7 +279,7 @@ def _numbers(values: FloatArray) -> str:
 
 
 def with_gravity(model: Model, gravity_m_s2: FloatArray) -> Model:
-    """The same model under another gravity."""
+    """The same model under another gravity, shape (3,)."""
     robot = replace(model.robot, gravity_m_s2=gravity_m_s2)
     return replace(model, robot=robot)
 
@@ -838,7 +838,7 @@ class Judged:
         return all(self.is_better(one) for one in small)
 
     def contradictions(self, gains: FloatArray) -> float:
-        """Number of currents with another sign than the nameplate.
+        """Number of currents with another sign than the nameplate, by the gains, shape (m,).
 
         That of a reversed axis counts half: where the axis of the URDF points the other way, both
         are reversed.
@@ -1026,7 +1026,7 @@ class GravityProducts:
         return slice(first, first + len(self.weighty))
 
     def directed(self, gravity_m_s2: FloatArray) -> Products:
-        """Products of [W(g) | v_i]."""
+        """Products of [W(g) | v_i] under a gravity g, shape (3,)."""
         return Products(self.turned(self.square, gravity_m_s2), self.rows)
 
     def turned(self, square: FloatArray, gravity_m_s2: FloatArray) -> FloatArray:

@@ -218,7 +218,7 @@ def _add_cross(out: FloatArray, a: FloatArray, b: FloatArray) -> None:
 
 
 def cos_sin(angle: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Cosine and sine to the last digit of one, by the half-angle.
+    """Cosine and sine of angles of any shape to the last digit of one, by the half-angle.
 
     numpy has a vector tangent, four times as fast.
     """

@@ -322,7 +322,9 @@ class Design:
         return np.isin(self.base.independent, payload_friction)
 
     def condition(self, information: FloatArray) -> float:
-        """Condition number of W, rows weighted by their noise; inf for a column without rows.
+        """Condition number of W, rows weighted by their noise, from the information, shape (u, u).
+
+        It is inf for a column without rows.
 
         What a payload adds to friction is left out: in bare or in loaded runs alone it is no
         separate unknown.
@@ -348,7 +350,8 @@ class Design:
         return np.asarray(100.0 * np.sqrt(variance) / scale)
 
     def rank(self, information: FloatArray) -> int:
-        """How many of the n independent directions of ln g are known to UNSEEN_PERCENT.
+        """How many of the n independent directions of ln g are known to UNSEEN_PERCENT by the
+        information, shape (u, u).
 
         They are the eigenvectors of its covariance, of unit length: their errors are independent of
             each other.

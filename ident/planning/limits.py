@@ -38,7 +38,7 @@ class JointLimits:
             object.__setattr__(self, name, as_array(f"limits.{name}", getattr(self, name)))
 
     def targets(self) -> tuple[FloatArray, FloatArray]:
-        """Return the least and the largest targets of a plan,
+        """Return the least and the largest targets of a plan, shape (n,) each,
         which keep a margin from the limits.
         """
         margin = POSITION_MARGIN * (self.upper - self.lower)
