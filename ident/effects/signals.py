@@ -14,7 +14,7 @@ from ident.data.dataset import Dataset
 from ident.equations.observation import Observation
 from ident.estimators.estimate import Estimate
 from ident.model.bodies import LINK_PARAMETERS, Payload
-from ident.model.model import JOINT_COLUMNS, Model
+from ident.model.model import Model
 from ident.model.robot import Motion
 
 STICKING_RAD_S = 0.005  #: Below this speed the noise of the filtered encoder decides the sign
@@ -118,9 +118,7 @@ class Arm:
     def _smooth_torque(self, motion: Motion) -> FloatArray:
         smooth = self.standard.copy()
         smooth[self.model.dry_friction_columns] = 0.0
-        # Three columns for each coupled motor: its dry friction is the last one.
-        first_dry_of_motor = JOINT_COLUMNS * self.model.robot.joint_count + 2
-        smooth[first_dry_of_motor::3] = 0.0
+        smooth[self.model.coupled_dry_friction_columns] = 0.0
         _, _, total = self.model.torques(motion, smooth)
         return total
 

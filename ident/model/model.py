@@ -260,6 +260,11 @@ class Model:
         return first + COUPLED_COLUMNS * np.arange(count)
 
     @property
+    def coupled_dry_friction_columns(self) -> IntArray:
+        """Column of fsm of each motor that turns with several joints, shape (coupled,)."""
+        return self._coupled_columns + 2
+
+    @property
     def friction_columns(self) -> IntArray:
         """Columns of fv and fs of each axis, and of fvm and fsm of each motor that turns with
         several joints.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -42,6 +44,11 @@ def test_columns_of_the_links_and_of_dry_friction_are_those_of_their_names(truth
         expected.append([f"{name}{number}" for name in LINK_PARAMETERS])
     assert names[truth.model.link_columns].tolist() == expected
     assert names[truth.model.dry_friction_columns].tolist() == [f"fs{number}" for number in numbers]
+    # The motor of the last wrist turns with two joints; what a payload adds to friction is behind.
+    by_payload = replace(truth.model, friction_by_payload=True)
+    for model in (truth.model, by_payload):
+        coupled_names = [model.columns[index].name for index in model.coupled_dry_friction_columns]
+        assert coupled_names == ["fsm6"]
     last_link_column = truth.model.link_columns[-1]
     link_column = last_link_column.tolist()
     assert np.arange(len(names))[truth.model.flange].tolist() == link_column
