@@ -88,7 +88,7 @@ from ident.estimators.least_squares import tls
 from ident.estimators.method import Method
 from ident.estimators.refusals import require_plausible
 from ident.estimators.turned_geometry import GEOMETRY
-from ident.model.geometry_derivatives import model_with_geometry
+from ident.model.geometry import model_with_geometry
 from ident.model.model import Model
 from ident.planning.gain_verdict import GainVerdict
 
