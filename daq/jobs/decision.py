@@ -250,15 +250,7 @@ def _write_proposal(session: Session, proposal: Proposal[Any], after_sha256: str
 
 
 def _proposed_gain(change: GainChange) -> ProposedGain:
-    return ProposedGain(
-        axis=change.axis,
-        key=change.key,
-        old=change.current_gain,
-        new=change.new,
-        std=change.std,
-        unit=change.unit,
-        change_percent=change.change_percent,
-    )
+    return ProposedGain.of(change, old=change.current_gain)
 
 
 def _finite(number: float) -> float | None:

@@ -368,7 +368,7 @@ def demo_report(outcome: DemoOutcome, seconds: float) -> DemoReport:
     first = next(iter(outcome.calibration.effects), None)
     effect = None
     if first is not None:
-        effect = FleetEffect(name=first.name, axis=first.axis)
+        effect = FleetEffect.of(first)
     entries = as_document(outcome.calibration)["effects"]
     effects = [EffectEntry.model_validate(entry, strict=False) for entry in entries]
     before_percent, before_percent_axes = _error_percent(before)
@@ -412,11 +412,9 @@ def demo_gains(outcome: DemoOutcome) -> list[DemoGain]:
 
 def _gain(gain: Gain, truth: float, paper_tls: float | None) -> DemoGain:
     error_percent = 100.0 * (gain.value / truth - 1.0)
-    return DemoGain(
-        axis=gain.axis,
-        nameplate=gain.nameplate,
+    return DemoGain.of(
+        gain,
         identified=gain.value,
-        std_percent=gain.std_percent,
         truth=truth,
         error_percent=error_percent,
         paper_tls=paper_tls,
@@ -424,20 +422,11 @@ def _gain(gain: Gain, truth: float, paper_tls: float | None) -> DemoGain:
 
 
 def _made(made: Plan) -> DemoPlan:
-    return DemoPlan(
-        moves=len(made.moves),
-        condition=made.condition,
-        predicted_std_percent=list(made.predicted_std_percent),
-    )
+    return DemoPlan.of(made, moves=len(made.moves))
 
 
 def _recorded(run: Recorded) -> DemoLog:
-    return DemoLog(
-        log=run.path.name,
-        samples=run.log.samples,
-        lost_cycles=run.log.lost_cycles,
-        valid=run.log.valid,
-    )
+    return DemoLog.of(run.log, log=run.path.name)
 
 
 def make_room(out: Path, logs: tuple[Path, ...]) -> tuple[Path, ...]:
