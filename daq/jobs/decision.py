@@ -44,9 +44,8 @@ def decide_outcome(
             over.
         AuditUnusable, OutputFailed: see `daq.writeback.target`.
     """
-    path = session.folder / CALIBRATION
     now = context.tools.now()
-    digest = sha256_of(path) or ""
+    digest = sha256_of(session.folder / CALIBRATION) or ""
     before = session.state.target
     touched = _written_since(context, session)
     if before is not None and _has_written(context, before, calibration):
@@ -59,9 +58,7 @@ def decide_outcome(
             context.journal.say(Level.NOTICE, words)
             return session.update(outcome=Outcome.APPLIED)
         return _saved_again(context, session, calibration)
-    proposal = _proposed(
-        context, Request(calibration, now, file=path, content=read_calibration_bytes(path))
-    )
+    proposal = _proposed(context, session, calibration, now)
     edit = proposal.edit
     decision = decision_of(
         proposal, known_of(history, context.target.subject, digest, edit.changes)
@@ -155,17 +152,18 @@ def _saved_again(context: SessionContext, session: Session, calibration: Calibra
     without its last entry in the audit log, they may not have saved.
     """
     now = context.tools.now()
-    path = session.folder / CALIBRATION
-    proposal = _proposed(
-        context, Request(calibration, now, file=path, content=read_calibration_bytes(path))
-    )
+    proposal = _proposed(context, session, calibration, now)
     context.journal.say(Level.NOTICE, "the drives have these gains, and may not have saved them")
     if proposal.refusals or not context.operator.approve(proposal, touched=False):
         return session.update(outcome=Outcome.PROPOSED)
     return _written(context, session, proposal, now)
 
 
-def _proposed(context: SessionContext, request: Request) -> Proposal[Any]:
+def _proposed(
+    context: SessionContext, session: Session, calibration: Calibration, now: datetime
+) -> Proposal[Any]:
+    path = session.folder / CALIBRATION
+    request = Request(calibration, now, file=path, content=read_calibration_bytes(path))
     with context.opened_target() as target:
         return context.tools.propose(target, request)
 
