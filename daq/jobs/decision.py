@@ -22,7 +22,7 @@ from daq.report.document import json_text
 from daq.report.job_schemas import FailedCheck, ProposalReport, ProposedGain
 from daq.writeback.gates.gate import Gate
 from daq.writeback.judgement import Spread, judge, known_of
-from daq.writeback.request import GainChange, Request
+from daq.writeback.request import Request
 from daq.writeback.target import Proposal, Written
 from ident.calibration import Calibration
 
@@ -230,6 +230,7 @@ def _written_since(context: SessionContext, session: Session) -> bool:
 
 def _write_proposal(session: Session, proposal: Proposal[Any], after_sha256: str) -> None:
     """Write the change next to the calibration, as JSON and as a diff."""
+    changes = [ProposedGain.of(change, old=change.current_gain) for change in proposal.edit.changes]
     refusals = [
         FailedCheck(gate=refusal.gate.value, text=str(refusal)) for refusal in proposal.refusals
     ]
@@ -237,7 +238,7 @@ def _write_proposal(session: Session, proposal: Proposal[Any], after_sha256: str
         file=str(proposal.edit.name),
         base_sha256=proposal.edit.base_sha256,
         after_sha256=after_sha256,
-        changes=[_proposed_gain(change) for change in proposal.edit.changes],
+        changes=changes,
         refusals=refusals,
     )
     contents = {PROPOSAL: json_text(report), DIFF: proposal.edit.diff}
@@ -245,10 +246,6 @@ def _write_proposal(session: Session, proposal: Proposal[Any], after_sha256: str
         path = session.folder / name
         with writing(path):
             replace_file(path, content.encode())
-
-
-def _proposed_gain(change: GainChange) -> ProposedGain:
-    return ProposedGain.of(change, old=change.current_gain)
 
 
 def _finite(number: float) -> float | None:

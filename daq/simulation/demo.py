@@ -381,8 +381,8 @@ def demo_report(outcome: DemoOutcome, seconds: float) -> DemoReport:
         error_after_percent=after_percent,
         error_before_percent_axes=before_percent_axes,
         error_after_percent_axes=after_percent_axes,
-        plans=[_made(made) for made in outcome.plans],
-        logs=[_recorded(run) for run in outcome.recorded],
+        plans=[DemoPlan.of(made, moves=len(made.moves)) for made in outcome.plans],
+        logs=[DemoLog.of(run.log, log=run.path.name) for run in outcome.recorded],
         controller_diff=outcome.proposal.edit.diff,
         applied=outcome.written is not None,
         seconds=seconds,
@@ -419,14 +419,6 @@ def _gain(gain: Gain, truth: float, paper_tls: float | None) -> DemoGain:
         error_percent=error_percent,
         paper_tls=paper_tls,
     )
-
-
-def _made(made: Plan) -> DemoPlan:
-    return DemoPlan.of(made, moves=len(made.moves))
-
-
-def _recorded(run: Recorded) -> DemoLog:
-    return DemoLog.of(run.log, log=run.path.name)
 
 
 def make_room(out: Path, logs: tuple[Path, ...]) -> tuple[Path, ...]:

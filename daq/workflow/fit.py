@@ -726,20 +726,6 @@ def close_loop(
         return judged(closed)
 
 
-def with_corrected_geometry(start: Fit) -> Fit:
-    """Identify again with the zeros and lengths that the encoders show;
-    the same fit where they contradict none.
-
-    The logs are read again. σ of the gains contains that of the geometry.
-
-    Raises:
-        DataError, IdentificationError: as for `fit`.
-    """
-    if start.is_corrected:
-        return start
-    return _with_uncertain_geometry(_with_geometry_of_encoders(start))
-
-
 def _with_uncertain_geometry(found: Fit) -> Fit:
     """Add the uncertainty of the corrected geometry to estimates that have none of it;
     the same fit without one.
