@@ -4,9 +4,8 @@ IdentificationError
 ├── ModelError            the URDF or drive train does not describe this robot
 ├── DataUnfit             the recording cannot be used: NaN, too short, too slow, wrong shape
 │   ├── PayloadMissing    no run has a payload of known mass, which free gains need
-│   ├── CurrentUnsigned   drives report the size of the current only
-│   └── ChannelUnfit      a channel shows by itself that it cannot be used: JointStill,
-│                         CurrentConstant, ReadingsDamaged
+│   └── ChannelUnfit      a channel shows by itself that it cannot be used: CurrentUnsigned,
+│                         JointStill, CurrentConstant, ReadingsDamaged
 ├── ModelContradicted     the declared model explains less of the data than it leaves
 │   ├── RolesExchanged    loaded and unloaded runs are mistaken for each other
 │   ├── ChannelsExchanged the currents of some axes are each other's
@@ -79,26 +78,6 @@ class PayloadMissing(DataUnfit):
         super().__init__(names, f"found {self.found}; expected {self.expected}; {self.remedy}")
 
 
-class CurrentUnsigned(DataUnfit):
-    """Drives report the size of the current only."""
-
-    def __init__(self, run: str, axes: tuple[str, ...], missing_sign: str) -> None:
-        names = ", ".join(axes)
-        self.subject = f"{_subject_of(run)}, axis {names}"
-        self.found = (
-            f"currents that are never {missing_sign} while the axes move both ways, and that no "
-            "load which is always carried explains"
-        )
-        self.expected = "a current with its sign: that of the torque"
-        self.remedy = (
-            "the drive, or the export, gives the size of the current only; take its signed value"
-        )
-        super().__init__(
-            run, f"axis {names}: found {self.found}; expected {self.expected}; {self.remedy}"
-        )
-        self.axes = axes
-
-
 class ChannelUnfit(DataUnfit):
     """A channel of a recording shows by itself that it cannot be used."""
 
@@ -112,6 +91,21 @@ class ChannelUnfit(DataUnfit):
         self.remedy = remedy
         super().__init__(run, f"axis {names}: found {found}; expected {expected}; {remedy}")
         self.axes = axes
+
+
+class CurrentUnsigned(ChannelUnfit):
+    """Drives report the size of the current only."""
+
+    def __init__(self, run: str, axes: tuple[str, ...], missing_sign: str) -> None:
+        super().__init__(
+            run,
+            axes,
+            found=f"currents that are never {missing_sign} while the axes move both ways, and that "
+            "no load which is always carried explains",
+            expected="a current with its sign: that of the torque",
+            remedy="the drive, or the export, gives the size of the current only; take its signed "
+            "value",
+        )
 
 
 class JointStill(ChannelUnfit):

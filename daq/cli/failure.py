@@ -28,10 +28,7 @@ if TYPE_CHECKING:
 
 #: Errors of the identification that have found, expected and remedy.
 WITH_EVIDENCE = (
-    identification.ModelContradicted
-    | identification.PayloadMissing
-    | identification.CurrentUnsigned
-    | identification.ChannelUnfit
+    identification.ModelContradicted | identification.PayloadMissing | identification.ChannelUnfit
 )
 NOTES = ("kept", "hint")
 """Labels of the notes that are shown. A verb adds one by ``error.add_note("hint: …")``."""

@@ -317,17 +317,16 @@ def _require_explained(calibration: Calibration, path: Path) -> None:
 
 
 def _declared(calibration: Calibration, path: Path) -> Cell:
-    from daq.config.same_cell import mismatch_of_calibration
+    from daq.config.same_cell import require_cell_of
 
     cell = read_cell(path)
-    found = mismatch_of_calibration(calibration, cell)
-    if found is not None:
-        raise ConfigurationInconsistent(
-            str(path),
-            found=found.found,
-            expected=found.expected,
-            remedy="give the cell that was calibrated",
-        )
+    require_cell_of(
+        calibration,
+        cell,
+        ConfigurationInconsistent,
+        str(path),
+        remedy="give the cell that was calibrated",
+    )
     return cell
 
 

@@ -18,7 +18,7 @@ from itertools import zip_longest
 from daq.config.cell import Cell, CellAxis
 from daq.config.cell_file import CELL, cell_from_bundle
 from daq.config.yaml_file import parse_yaml
-from daq.errors import ConfigurationInconsistent, LogsDiffer, SchemaMismatch, first_few
+from daq.errors import ConfigurationInconsistent, DaqError, LogsDiffer, SchemaMismatch, first_few
 from ident.calibration import CalibratedDrive, CalibratedJoint, CalibratedRobot, Calibration
 from ident.model.urdf import read_urdf
 
@@ -301,6 +301,19 @@ def mismatch_of_calibration(calibration: Calibration, cell: Cell) -> Mismatch | 
         f"cell {cell.name!r} with the axes {', '.join(cell.axis_names)}",
         f"cell {calibration.cell!r} with the axes {', '.join(axes)}, as in the calibration",
     )
+
+
+def require_cell_of(
+    calibration: Calibration, cell: Cell, error: type[DaqError], subject: str, *, remedy: str
+) -> None:
+    """Refuse a calibration that is of another cell, or of another robot.
+
+    Raises:
+        DaqError: of the given kind, about the subject.
+    """
+    found = mismatch_of_calibration(calibration, cell)
+    if found is not None:
+        raise error(subject, found=found.found, expected=found.expected, remedy=remedy)
 
 
 def differing_sections(own: Cell, given: Cell) -> tuple[str, ...]:

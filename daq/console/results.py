@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from daq.config.cell import Cell
-from daq.config.same_cell import mismatch_of_calibration
+from daq.config.same_cell import require_cell_of
 from daq.documents.calibration_file import load_calibration
 from daq.documents.session_state import GuidedState, Outcome
 from daq.errors import CalibrationRefused, DaqError, ExitCode
@@ -159,14 +159,13 @@ class Results:
         if known is None:
             return None
         path, calibration = known
-        mismatch = mismatch_of_calibration(calibration, self._cell)
-        if mismatch is not None:
-            raise CalibrationRefused(
-                str(path),
-                found=mismatch.found,
-                expected=mismatch.expected,
-                remedy="give the calibration of this cell",
-            )
+        require_cell_of(
+            calibration,
+            self._cell,
+            CalibrationRefused,
+            str(path),
+            remedy="give the calibration of this cell",
+        )
         error = calibration.holdout_error_percent
         measured_on = "held-out runs"
         if error is None:

@@ -22,7 +22,7 @@ from daq.report.document import json_text
 from daq.report.job_schemas import FailedCheck, ProposalReport, ProposedGain
 from daq.writeback.gates.gate import Gate
 from daq.writeback.judgement import Spread, judge, known_of
-from daq.writeback.request import GainChange, Request
+from daq.writeback.request import Request
 from daq.writeback.target import Proposal, Written
 from ident.calibration import Calibration
 
@@ -44,9 +44,8 @@ def decide_outcome(
             over.
         AuditUnusable, OutputFailed: see `daq.writeback.target`.
     """
-    path = session.folder / CALIBRATION
     now = context.tools.now()
-    digest = sha256_of(path) or ""
+    digest = sha256_of(session.folder / CALIBRATION) or ""
     before = session.state.target
     touched = _written_since(context, session)
     if before is not None and _has_written(context, before, calibration):
@@ -59,9 +58,7 @@ def decide_outcome(
             context.journal.say(Level.NOTICE, words)
             return session.update(outcome=Outcome.APPLIED)
         return _saved_again(context, session, calibration)
-    proposal = _proposed(
-        context, Request(calibration, now, file=path, content=read_calibration_bytes(path))
-    )
+    proposal = _proposed(context, session, calibration, now)
     edit = proposal.edit
     decision = decision_of(
         proposal, known_of(history, context.target.subject, digest, edit.changes)
@@ -155,17 +152,18 @@ def _saved_again(context: SessionContext, session: Session, calibration: Calibra
     without its last entry in the audit log, they may not have saved.
     """
     now = context.tools.now()
-    path = session.folder / CALIBRATION
-    proposal = _proposed(
-        context, Request(calibration, now, file=path, content=read_calibration_bytes(path))
-    )
+    proposal = _proposed(context, session, calibration, now)
     context.journal.say(Level.NOTICE, "the drives have these gains, and may not have saved them")
     if proposal.refusals or not context.operator.approve(proposal, touched=False):
         return session.update(outcome=Outcome.PROPOSED)
     return _written(context, session, proposal, now)
 
 
-def _proposed(context: SessionContext, request: Request) -> Proposal[Any]:
+def _proposed(
+    context: SessionContext, session: Session, calibration: Calibration, now: datetime
+) -> Proposal[Any]:
+    path = session.folder / CALIBRATION
+    request = Request(calibration, now, file=path, content=read_calibration_bytes(path))
     with context.opened_target() as target:
         return context.tools.propose(target, request)
 
@@ -232,6 +230,7 @@ def _written_since(context: SessionContext, session: Session) -> bool:
 
 def _write_proposal(session: Session, proposal: Proposal[Any], after_sha256: str) -> None:
     """Write the change next to the calibration, as JSON and as a diff."""
+    changes = [ProposedGain.of(change, old=change.current_gain) for change in proposal.edit.changes]
     refusals = [
         FailedCheck(gate=refusal.gate.value, text=str(refusal)) for refusal in proposal.refusals
     ]
@@ -239,7 +238,7 @@ def _write_proposal(session: Session, proposal: Proposal[Any], after_sha256: str
         file=str(proposal.edit.name),
         base_sha256=proposal.edit.base_sha256,
         after_sha256=after_sha256,
-        changes=[_proposed_gain(change) for change in proposal.edit.changes],
+        changes=changes,
         refusals=refusals,
     )
     contents = {PROPOSAL: json_text(report), DIFF: proposal.edit.diff}
@@ -247,18 +246,6 @@ def _write_proposal(session: Session, proposal: Proposal[Any], after_sha256: str
         path = session.folder / name
         with writing(path):
             replace_file(path, content.encode())
-
-
-def _proposed_gain(change: GainChange) -> ProposedGain:
-    return ProposedGain(
-        axis=change.axis,
-        key=change.key,
-        old=change.current_gain,
-        new=change.new,
-        std=change.std,
-        unit=change.unit,
-        change_percent=change.change_percent,
-    )
 
 
 def _finite(number: float) -> float | None:

@@ -42,9 +42,8 @@ from daq.jobs.cell_fit import (
 )
 from daq.jobs.fleet_survey import CellLogs, SeenLog, StoredLog, UnknownLog, by_cell, survey
 from daq.report.gains import with_deviation
-from daq.report.job_schemas import FleetCell, FleetEffect, FleetFailure, FleetGain, FleetReport
+from daq.report.job_schemas import FleetCell, FleetEffect, FleetFailure, FleetReport
 from daq.report.text import Sentence, WholeTable, inert, inert_row, printable, spelled_bytes
-from ident.calibration import Gain
 
 HERE = "127.0.0.1"
 TRIMMING = "distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_"
@@ -510,14 +509,11 @@ def _fleet_cell(row: FleetRow) -> FleetCell:
             exit_code=result.exit_code,
             error=FleetFailure(kind=result.kind, text=spelled_bytes(result.text)),
         )
-    return FleetCell(
+    return FleetCell.of(
+        result,
         **about,
-        gains=list(map(_fleet_gain, result.gains)),
-        worst=_fleet_gain(result.worst),
-        error_percent=result.error_percent,
         error_on=_measured_on(result),
         effects=[FleetEffect(name=name, axis=axis) for name, axis in result.effects],
-        partial=result.partial,
         exit_code=0,
         error=None,
     )
@@ -527,9 +523,3 @@ def _measured_on(summary: Summary) -> Literal["holdout", "fit"]:
     if summary.held_out:
         return "holdout"
     return "fit"
-
-
-def _fleet_gain(gain: Gain) -> FleetGain:
-    return FleetGain(
-        axis=gain.axis, value=gain.value, std=gain.std, std_percent=gain.std_percent, unit=gain.unit
-    )

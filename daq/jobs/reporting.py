@@ -23,6 +23,7 @@ from daq.errors import (
     HistoryUnreadable,
     OutputFailed,
     WriteUnconfirmed,
+    counted,
     exit_code,
     writing,
 )
@@ -254,13 +255,8 @@ def _as_report(
 
 
 def _run_text(run: RecordedRun) -> str:
-    recordings = "recordings"
-    if run.attempts == 1:
-        recordings = "recording"
-    return (
-        f"  {run.name}: {run.samples} samples, {run.lost_cycles} cycles lost, {run.attempts} "
-        f"{recordings}"
-    )
+    recordings = counted(run.attempts, "recording")
+    return f"  {run.name}: {run.samples} samples, {run.lost_cycles} cycles lost, {recordings}"
 
 
 def text(conclusion: Conclusion, cell_file: Path) -> str:

@@ -17,7 +17,7 @@ import numpy as np
 from mcap.writer import CompressionType, Writer
 
 from daq.config.cell import Cell, joint_names
-from daq.config.same_cell import mismatch_of_calibration
+from daq.config.same_cell import require_cell_of
 from daq.errors import ConfigurationInconsistent, OutputFailed, UsageError
 from daq.files import fsync_folder
 from daq.log.conversion import continuous_counts, scaling
@@ -86,14 +86,13 @@ def export_bag(path: Path, out: Path, calibration: Calibration | None = None) ->
     cell = log.head.cell(path)
     gains = []
     if calibration is not None:
-        mismatch = mismatch_of_calibration(calibration, cell)
-        if mismatch is not None:
-            raise ConfigurationInconsistent(
-                str(path),
-                found=mismatch.found,
-                expected=mismatch.expected,
-                remedy="give a calibration of this cell",
-            )
+        require_cell_of(
+            calibration,
+            cell,
+            ConfigurationInconsistent,
+            str(path),
+            remedy="give a calibration of this cell",
+        )
         gains = [gain.value for gain in calibration.gains]
     messages = sorted(_messages(log, cell, gains), key=lambda message: message[0])
     counts = Counter(topic for _, topic, _ in messages)

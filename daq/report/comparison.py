@@ -17,7 +17,7 @@ from pathlib import Path
 
 from daq.config.cell import Cell
 from daq.config.policy import ApplyPolicy
-from daq.config.same_cell import mismatch_of_calibration
+from daq.config.same_cell import require_cell_of
 from daq.errors import CalibrationRefused, DaqError
 from daq.files import sha256
 from daq.ledger.fold import Event
@@ -155,14 +155,13 @@ def compare(
     Raises:
         CalibrationRefused: it is of another cell.
     """
-    mismatch = mismatch_of_calibration(request.calibration, cell)
-    if mismatch is not None:
-        raise CalibrationRefused(
-            f"calibration of cell {request.calibration.cell!r}",
-            found=mismatch.found,
-            expected=mismatch.expected,
-            remedy="give the cell that was calibrated",
-        )
+    require_cell_of(
+        request.calibration,
+        cell,
+        CalibrationRefused,
+        f"calibration of cell {request.calibration.cell!r}",
+        remedy="give the cell that was calibrated",
+    )
     standing = _standing(cell, request, file or cell.controller_path, audit)
     if cell.controller is not None and not cell.controller.gains:
         places = zip(cell.axis_names, cell.controller.objects, strict=True)

@@ -41,15 +41,13 @@ class OwnTorque(Report):
 CERTAIN_SIGMAS = 3.0
 
 
-def plot_gains(
-    gains: tuple[Gain, ...], truth: Mapping[str, float] | None = None, *, title: str
-) -> bytes:
+def plot_gains(gains: tuple[Gain, ...], truth: Mapping[str, float] | None = None) -> bytes:
     """Draw how far each identified gain is from its nameplate, with its uncertainty.
 
     Gains of different axes differ by an order of magnitude and may be negative, so all are shown in
     percent. Return a PNG. `truth` is by axis, for a simulated cell only.
     """
-    figure, place = single(title, 3.2)
+    figure, place = single("Joint drive gains", 3.2)
     positions = np.arange(len(gains))
     change = [gain.change_percent for gain in gains]
     width = [SHOWN_SIGMAS * 100.0 * gain.std / abs(gain.nameplate) for gain in gains]

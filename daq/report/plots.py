@@ -50,7 +50,7 @@ def draw_fit(
         run = "first run of the fit"
     torques = sheet(draw_torques(final, fitted.cell), f"Joint torques, {run}")
     replace_file(out / "torques.svg", torques)
-    gains = plot_gains(calibration.gains, truth, title="Joint drive gains")
+    gains = plot_gains(calibration.gains, truth)
     replace_file(out / "gains.png", gains)
     for step in fitted.steps:
         for placed in step.after.effects:

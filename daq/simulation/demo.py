@@ -368,7 +368,7 @@ def demo_report(outcome: DemoOutcome, seconds: float) -> DemoReport:
     first = next(iter(outcome.calibration.effects), None)
     effect = None
     if first is not None:
-        effect = FleetEffect(name=first.name, axis=first.axis)
+        effect = FleetEffect.of(first)
     entries = as_document(outcome.calibration)["effects"]
     effects = [EffectEntry.model_validate(entry, strict=False) for entry in entries]
     before_percent, before_percent_axes = _error_percent(before)
@@ -381,8 +381,8 @@ def demo_report(outcome: DemoOutcome, seconds: float) -> DemoReport:
         error_after_percent=after_percent,
         error_before_percent_axes=before_percent_axes,
         error_after_percent_axes=after_percent_axes,
-        plans=[_made(made) for made in outcome.plans],
-        logs=[_recorded(run) for run in outcome.recorded],
+        plans=[DemoPlan.of(made, moves=len(made.moves)) for made in outcome.plans],
+        logs=[DemoLog.of(run.log, log=run.path.name) for run in outcome.recorded],
         controller_diff=outcome.proposal.edit.diff,
         applied=outcome.written is not None,
         seconds=seconds,
@@ -412,31 +412,12 @@ def demo_gains(outcome: DemoOutcome) -> list[DemoGain]:
 
 def _gain(gain: Gain, truth: float, paper_tls: float | None) -> DemoGain:
     error_percent = 100.0 * (gain.value / truth - 1.0)
-    return DemoGain(
-        axis=gain.axis,
-        nameplate=gain.nameplate,
+    return DemoGain.of(
+        gain,
         identified=gain.value,
-        std_percent=gain.std_percent,
         truth=truth,
         error_percent=error_percent,
         paper_tls=paper_tls,
-    )
-
-
-def _made(made: Plan) -> DemoPlan:
-    return DemoPlan(
-        moves=len(made.moves),
-        condition=made.condition,
-        predicted_std_percent=list(made.predicted_std_percent),
-    )
-
-
-def _recorded(run: Recorded) -> DemoLog:
-    return DemoLog(
-        log=run.path.name,
-        samples=run.log.samples,
-        lost_cycles=run.log.lost_cycles,
-        valid=run.log.valid,
     )
 
 

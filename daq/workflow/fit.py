@@ -88,7 +88,7 @@ from ident.estimators.least_squares import tls
 from ident.estimators.method import Method
 from ident.estimators.refusals import require_plausible
 from ident.estimators.turned_geometry import GEOMETRY
-from ident.model.geometry_derivatives import model_with_geometry
+from ident.model.geometry import model_with_geometry
 from ident.model.model import Model
 from ident.planning.gain_verdict import GainVerdict
 
@@ -724,20 +724,6 @@ def close_loop(
         ):
             return _with_holdout_judged(closed)
         return judged(closed)
-
-
-def with_corrected_geometry(start: Fit) -> Fit:
-    """Identify again with the zeros and lengths that the encoders show;
-    the same fit where they contradict none.
-
-    The logs are read again. σ of the gains contains that of the geometry.
-
-    Raises:
-        DataError, IdentificationError: as for `fit`.
-    """
-    if start.is_corrected:
-        return start
-    return _with_uncertain_geometry(_with_geometry_of_encoders(start))
 
 
 def _with_uncertain_geometry(found: Fit) -> Fit:

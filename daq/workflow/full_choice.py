@@ -15,7 +15,7 @@ from enum import Enum
 import numpy as np
 
 from daq.workflow.full_parameters import DEFAULT_TOLERANCE
-from daq.workflow.urdf_export import PhysicalRobot, Shift, identified_base, physical_robot
+from daq.workflow.urdf_export import PhysicalRobot, identified_base, physical_robot
 from ident.arrays import FloatArray
 from ident.calibration import AcceptedEffect, Calibration
 from ident.errors import ModelError
@@ -126,10 +126,7 @@ def _robot_of(
     parameters = PhysicalParameters.of(
         standard, model, base.grouping, base.values, base.columns, prior
     )
-    shifts: tuple[Shift, ...] = ()
-    if not parameters.exact:
-        shifts = base.shifts(parameters.realised)
-    return PhysicalRobot(parameters, prior, shifts)
+    return PhysicalRobot(parameters, prior, base.shifts(parameters))
 
 
 def _of_full_set(found: FullSet, model: Model) -> tuple[FloatArray, FloatArray]:

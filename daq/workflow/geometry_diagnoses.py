@@ -15,8 +15,13 @@ from daq.config.cell import Cell, CellAxis, model_of
 from daq.workflow.zero_text import DEGREES, MILLIMETRES, zero_off_text, zero_remedy
 from ident.calibration import Calibration, EncoderMisfit, GeometryCorrection
 from ident.errors import Diagnosis, ModelError
-from ident.model.geometry import GeometryChange, GeometryKind, GeometryParameter, described_length
-from ident.model.geometry_derivatives import model_with_geometry
+from ident.model.geometry import (
+    GeometryChange,
+    GeometryKind,
+    GeometryParameter,
+    described_length,
+    model_with_geometry,
+)
 from ident.model.model import Model
 from ident.model.robot import JointKind
 

@@ -1102,8 +1102,8 @@ def way_to_first_target(
     return (*moves, slow), remark
 
 
-def check_way(cell: Cell, start_rad: FloatArray, end_rad: FloatArray, way: str) -> None:
-    """Refuse a way, named for the message, that leaves what the cell file declares.
+def check_return(cell: Cell, start_rad: FloatArray, end_rad: FloatArray) -> None:
+    """Refuse a way back that leaves what the cell file declares.
 
     Raises:
         MotionRefused: with the place and the bodies that come too close.
@@ -1113,8 +1113,8 @@ def check_way(cell: Cell, start_rad: FloatArray, end_rad: FloatArray, way: str) 
     found = _checker(cell).obstruction(start_rad, end_rad)
     if found is not None:
         raise MotionRefused(
-            f"{way}: found {_spell(cell, found)}; bring the robot within its limits by hand, or "
-            f"correct {_keys(found)} in the cell file"
+            f"the slow return within the limits: found {_spell(cell, found)}; bring the robot "
+            f"within its limits by hand, or correct {_keys(found)} in the cell file"
         )
 
 

@@ -38,7 +38,7 @@ from daq.workflow.experiment import limits_of, path_of
 from daq.workflow.interlock import release_check
 from daq.workflow.nameplates import check_nameplates, nameplate_warnings
 from daq.workflow.on_time import on_time
-from daq.workflow.plan import Plan, check_way, way_to_first_target
+from daq.workflow.plan import Plan, check_return, way_to_first_target
 from daq.workflow.safeguards import (
     DiskRoom,
     FreeBytes,
@@ -603,7 +603,7 @@ def recovery_move(
     _require_allowed(cell, found, largest_share)
     here = scale.joint_position(np.array(start_counts))
     there = scale.joint_position(np.array(target))
-    check_way(cell, here, there, "the slow return within the limits")
+    check_return(cell, here, there)
     slow = tuple(map(_recovery_limits, start_counts, limits))
     return (
         synchronised_move(start_counts, tuple(target), slow),

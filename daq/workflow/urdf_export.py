@@ -82,10 +82,14 @@ class IdentifiedBase:
         """Identified values, shape (b,)."""
         return np.array([parameter.value for parameter in self.parameters])
 
-    def shifts(self, realised: FloatArray) -> tuple[Shift, ...]:
-        """List the changes to other base parameters, shape (b,), the largest first."""
+    def shifts(self, possible: PhysicalParameters) -> tuple[Shift, ...]:
+        """List the changes to the base parameters of a possible robot, the largest first;
+        none where it has the identified ones.
+        """
+        if possible.exact:
+            return ()
         found: list[Shift] = []
-        for parameter, after in zip(self.parameters, realised.tolist(), strict=True):
+        for parameter, after in zip(self.parameters, possible.realised.tolist(), strict=True):
             change = abs(after - parameter.value)
             deviations = float("inf")
             if parameter.std > 0.0:
@@ -151,10 +155,7 @@ def physical_robot(
     prior = inertia_prior(urdf)
     friction = _axes_with_other_friction(calibration, missing)
     found = physical_parameters(model, base.grouping, base.values, base.columns, prior, friction)
-    shifts: tuple[Shift, ...] = ()
-    if not found.exact:
-        shifts = base.shifts(found.realised)
-    return PhysicalRobot(found, prior, shifts)
+    return PhysicalRobot(found, prior, base.shifts(found))
 
 
 def _axes_with_other_friction(

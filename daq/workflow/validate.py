@@ -18,7 +18,7 @@ import numpy as np
 from daq.arguments import PATHS, checks_arguments, of_kind, optional
 from daq.config.cell import Cell, model_of
 from daq.config.same_cell import GRAVITY as GRAVITY_SECTION
-from daq.config.same_cell import differing_zeros, mismatch_of_calibration
+from daq.config.same_cell import differing_zeros, require_cell_of
 from daq.errors import CalibrationUnreadable, LogsDiffer
 from daq.log.conversion import load_run
 from daq.workflow.diagnoses import DIAGNOSED_AS, drift_diagnosis, with_verbs
@@ -188,14 +188,13 @@ def check_cell(calibration: Calibration, log: Path, cell: Cell) -> None:
     Raises:
         LogsDiffer: it is one.
     """
-    found = mismatch_of_calibration(calibration, cell)
-    if found is not None:
-        raise LogsDiffer(
-            str(log),
-            found=found.found,
-            expected=found.expected,
-            remedy="give logs of that cell, or the calibration of this one",
-        )
+    require_cell_of(
+        calibration,
+        cell,
+        LogsDiffer,
+        str(log),
+        remedy="give logs of that cell, or the calibration of this one",
+    )
 
 
 def unpredictable(calibration: Calibration, payload: Payload | None) -> str:

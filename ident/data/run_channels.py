@@ -214,21 +214,18 @@ def missing_joint(runs: Sequence[RunChannels], axes: Sequence[str]) -> JointStil
     return None
 
 
-def still_joint(
-    runs: Sequence[RunChannels], axes: Sequence[str], consequence: str
-) -> JointStill | None:
+def still_joint(runs: Sequence[RunChannels], axes: Sequence[str]) -> JointStill | None:
     """Return the error for runs in which a joint never moves, where the fit contradicts itself.
 
     Args:
         runs: of the fit.
         axes: name of each axis.
-        consequence: what the fit shows, in words.
     """
     own = [run for run in runs if np.any(run.still)]
     if not own:
         return None
     still = np.any([run.still for run in own], axis=0)
-    found = f"{_still_text(own, still, axes)}, and {consequence}"
+    found = f"{_still_text(own, still, axes)}, and a fit that contradicts itself"
     return JointStill(_names(own), _still_axes(still, axes), found)
 
 

@@ -133,16 +133,24 @@ def compare_on_holdout(start: Evidence, before: Evidence, after: Evidence) -> Er
     """
     if before.holdout is None or after.holdout is None:
         raise ValueError("two models can be compared on held-out rows only if runs were held out")
-    rows = before.holdout
-    noise_a = start.estimate.axis_noise
-    first = squares_left(before.holdout, before.estimate)
-    second = squares_left(after.holdout, after.estimate)
+    return change_of_squares(
+        before.holdout,
+        squares_left(before.holdout, before.estimate),
+        squares_left(after.holdout, after.estimate),
+        start.estimate.axis_noise,
+    )
+
+
+def change_of_squares(
+    rows: Observation, before: FloatArray, after: FloatArray, noise_a: FloatArray
+) -> ErrorChange:
+    """Compare squared errors of all rows [A²], shape (m, r) both, in units of the noise."""
     used = rows.motor_use
     motor, source = np.nonzero(used)
     variance = np.square(noise_a)[motor]
     return change_of_errors(
-        before=first[used] / variance,
-        after=second[used] / variance,
+        before=before[used] / variance,
+        after=after[used] / variance,
         motor=motor,
         move=rows.move[source],
         run=rows.run[source],

@@ -29,8 +29,8 @@ import numpy as np
 
 from ident.arrays import BoolArray, FloatArray, IntArray, takes
 from ident.data.conditioning import Conditioning, as_recorded, low_pass, rows_lost
-from ident.discovery.before_after import squares_left
-from ident.discovery.error_change import ErrorChange, change_of_errors
+from ident.discovery.before_after import change_of_squares, squares_left
+from ident.discovery.error_change import ErrorChange
 from ident.discovery.evidence import Evidence
 from ident.discovery.joining import UNFITTED
 from ident.discovery.late_currents import rough_torque_rates
@@ -357,20 +357,11 @@ def _with_delays(evidence: Evidence, rows: Observation) -> Observation:
 
 def _change(evidence: Evidence, before: Observation, after: Observation) -> ErrorChange:
     """Compare two models of the same rows on stretches that are left out in turn."""
-    used = before.motor_use
-    squares: list[FloatArray] = []
-    for rows in (before, after):
-        squares.append(_left_out_squares(evidence, rows))
-    noise_a = evidence.estimate.axis_noise
-    motor, source = np.nonzero(used)
-    variance = np.square(noise_a)[motor]
-    return change_of_errors(
-        before=squares[0][used] / variance,
-        after=squares[1][used] / variance,
-        motor=motor,
-        move=before.move[source],
-        run=before.run[source],
-        motors=len(noise_a),
+    return change_of_squares(
+        before,
+        _left_out_squares(evidence, before),
+        _left_out_squares(evidence, after),
+        evidence.estimate.axis_noise,
     )
 
 

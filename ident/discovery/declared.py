@@ -8,7 +8,7 @@ a base that leans by a degree makes a true balancer look impossible.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -30,7 +30,6 @@ def with_declared(
     start: Evidence,
     declared: Sequence[PlacedEffect],
     rng: np.random.Generator,
-    progress: Callable[[str], None] = lambda _: None,
     axes: Sequence[str] = (),
 ) -> tuple[Step, ...]:
     """Add effects that the cell declares, and refit everything with each;
@@ -41,8 +40,7 @@ def with_declared(
         declared: the effects, with the settings to begin with.
         rng: of the bootstrap, for what the findings say, and of the geometry's test where an effect
             is impossible.
-        progress: called with a description of each step.
-        axes: their names in it; those of the robot's joints when empty.
+        axes: their names; those of the robot's joints when empty.
 
     Returns:
         a step an effect; a search that begins with the last one's evidence keeps them. Where the
@@ -61,13 +59,12 @@ def with_declared(
     steps: list[Step] = []
     names = axes or [joint.name for joint in start.model.robot.places]
     for placed in declared:
-        name = placed.name_among(names)
-        progress(f"fitting the declared {name}")
         joined = _with_declared_form(evidence, declared_forms(placed, evidence.training, names))
         model = resettled(linearised(replace(joined, declared=len(joined.effects)), cache))
         evidence = model.evidence
         finding = _finding_beside_others(model, evidence.effects[-1], rng, gates)
         if finding is None:
+            name = placed.name_among(names)
             raise EffectRefused(f"the declared {name}: the model contains it already")
         limits_nm = detection_limits_nm(model.search_problem, gates)
         steps.append(Step((), (), limits_nm, finding, evidence, declared=True))

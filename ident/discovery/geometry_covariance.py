@@ -20,8 +20,7 @@ from ident.errors import IdentificationError
 from ident.estimators.estimate import Estimate, Identification
 from ident.estimators.geometry_estimate import GeometryFinding
 from ident.estimators.identify import estimate_with
-from ident.model.geometry import GeometryChange
-from ident.model.geometry_derivatives import model_with_geometry
+from ident.model.geometry import GeometryChange, model_with_geometry
 from ident.model.model import Column, Model
 
 LEAST_STEP = 1e-4

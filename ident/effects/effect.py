@@ -20,7 +20,7 @@ import numpy as np
 from ident.arrays import FloatArray
 from ident.data.conditioning import Conditioning
 from ident.data.dataset import Dataset
-from ident.effects.signals import Abscissa, Signals
+from ident.effects.signals import Abscissa, Signals, watched_s
 from ident.equations.rows import torques_at_rows
 from ident.errors import EffectRefused
 from ident.model.model import Column, DriveTrain, Model
@@ -299,6 +299,29 @@ class Effect(ABC):
     def with_settings(self, settings: Mapping[str, float]) -> Self:
         """Return the same effect with some of its searched parameters changed."""
         return replace(self, **settings)
+
+
+@dataclass(frozen=True, slots=True)
+class FadingEffect(Effect):
+    """An effect that fades with time, or settles."""
+
+    time_constant_s: Annotated[float, Range(1e-2, 1e6)]  #: η
+    #: 1 where t counts from the first run of the session, 0 where from the beginning of each run,
+    #: as after a power-on.
+    whole_session: Switch
+
+    def fits_in(self, runs: Sequence[Signals], axis: int) -> bool:
+        """Whether it fades while it is watched: over the session, or over the longest run."""
+        del axis
+        return self.time_constant_s <= watched_s(runs, whole_session=bool(self.whole_session))
+
+    def left(self, signals: Signals) -> FloatArray:
+        """What is left of it, e^(−t/η), shape (k,)."""
+        if self.whole_session:
+            time_s = signals.session_s
+        else:
+            time_s = signals.time_s
+        return np.asarray(np.exp(-time_s / self.time_constant_s))
 
 
 def sense_fault(sense: int) -> str:

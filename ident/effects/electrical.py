@@ -4,7 +4,6 @@ and late currents.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -12,8 +11,8 @@ import numpy as np
 from scipy.linalg import lapack
 
 from ident.arrays import FloatArray
-from ident.effects.effect import Effect, GearSide, Property, Range, Reported, Switch
-from ident.effects.signals import Abscissa, Signals, watched_s
+from ident.effects.effect import Effect, FadingEffect, GearSide, Property, Range, Reported, Switch
+from ident.effects.signals import Abscissa, Signals
 from ident.model.model import Column
 from ident.model.regressor import cos_sin
 
@@ -91,7 +90,7 @@ class Cogging(Effect):
 
 
 @dataclass(frozen=True, slots=True)
-class OffsetDrift(Effect):
+class OffsetDrift(FadingEffect):
     """τ = c · e^(−t/η), at the motor;  c > 0:
     the reference is too high by c/g at first, beside the declared offset.
 
@@ -105,30 +104,32 @@ class OffsetDrift(Effect):
     abscissa = Abscissa.TIME
     coefficients = (Column("offset", "Nm"),)
 
-    time_constant_s: Annotated[float, Range(1e-2, 1e6)]  #: η
-    #: 1 where t counts from the first run of the session, 0 where from the beginning of each run,
-    #: as after a power-on.
-    whole_session: Switch
-
-    def fits_in(self, runs: Sequence[Signals], axis: int) -> bool:
-        """Whether the offset settles while it is watched:
-        over the session, or over the longest run.
-        """
-        del axis
-        return self.time_constant_s <= watched_s(runs, whole_session=bool(self.whole_session))
-
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Columns, shape (1, k)."""
         del axis
-        if self.whole_session:
-            time_s = signals.session_s
-        else:
-            time_s = signals.time_s
-        return np.asarray(np.exp(-time_s / self.time_constant_s))[None]
+        return self.left(signals)[None]
 
 
 @dataclass(frozen=True, slots=True)
-class Lag(Effect):
+class LateCurrent(Effect):
+    """A current that was recorded later than the torque, or earlier."""
+
+    declares = Property.RATE_OF_TORQUE
+    abscissa = Abscissa.TORQUE_RATE
+    reported = Reported.DELAY
+    form_settings = ("backwards",)
+    added_settings = ("filter_s", "backwards")
+
+    filter_s: Annotated[float, Range(0.0, 0.1)] = 0.0  #: T
+    backwards: Switch = 0  #: 1 where the filter runs backwards in time, else 0
+
+    def rate(self, torque_nm: FloatArray, rate_hz: float) -> FloatArray:
+        """ẏ of a torque [Nm/s], of its shape."""
+        return filtered_rate(torque_nm, rate_hz, self.filter_s, backwards=bool(self.backwards))
+
+
+@dataclass(frozen=True, slots=True)
+class Lag(LateCurrent):
     """τ = −c · ẏ,  T ẏ + y = g v;  c > 0: the current is late by c; c < 0:
     it is early, by 10 ms at most.
 
@@ -141,29 +142,16 @@ class Lag(Effect):
 
     name = "lag"
     side = GearSide.MOTOR
-    declares = Property.RATE_OF_TORQUE
-    abscissa = Abscissa.TORQUE_RATE
     coefficients = (Column("time", "s", least=-EARLIEST_S),)
-    reported = Reported.DELAY
-    form_settings = ("backwards",)
-    added_settings = ("filter_s", "backwards")
-
-    filter_s: Annotated[float, Range(0.0, 0.1)] = 0.0  #: T
-    backwards: Switch = 0  #: 1 where the filter runs backwards in time, else 0
 
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Columns, shape (1, k)."""
-        rate = filtered_rate(
-            signals.motor_torque_nm[axis],
-            signals.rate_hz,
-            self.filter_s,
-            backwards=bool(self.backwards),
-        )
+        rate = self.rate(signals.motor_torque_nm[axis], signals.rate_hz)
         return -rate[None]
 
 
 @dataclass(frozen=True, slots=True)
-class TimeSkew(Effect):
+class TimeSkew(LateCurrent):
     """τ_i = −c · ẏ_i,  T ẏ_i + y_i = g_i v_i, of every motor i;  c > 0: all currents are late by c.
 
     On one axis a delay is a `Lag` (see there for T); the same delay on all axes is a fault of the
@@ -173,21 +161,11 @@ class TimeSkew(Effect):
 
     name = "time-skew"
     side = GearSide.ALL_MOTORS
-    declares = Property.RATE_OF_TORQUE
-    abscissa = Abscissa.TORQUE_RATE
     coefficients = (Column("time", "s"),)
-    reported = Reported.DELAY
-    form_settings = ("backwards",)
-    added_settings = ("filter_s", "backwards")
-
-    filter_s: Annotated[float, Range(0.0, 0.1)] = 0.0  #: T
-    backwards: Switch = 0  #: 1 where the filter runs backwards in time, else 0
 
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Columns, shape (n, 1, k); the axis does not matter."""
-        rate = filtered_rate(
-            signals.motor_torque_nm, signals.rate_hz, self.filter_s, backwards=bool(self.backwards)
-        )
+        rate = self.rate(signals.motor_torque_nm, signals.rate_hz)
         return -rate[:, None]
 
 

@@ -13,6 +13,7 @@ from ident.arrays import FloatArray
 from ident.effects.effect import (
     AxisNumber,
     Effect,
+    FadingEffect,
     GearSide,
     Property,
     Range,
@@ -22,7 +23,7 @@ from ident.effects.effect import (
     sense_fault,
 )
 from ident.effects.rotor import least_rotor_rest, loss_columns
-from ident.effects.signals import REFERENCE_C, Abscissa, Signals, distance_since_reversal, watched_s
+from ident.effects.signals import REFERENCE_C, Abscissa, Signals, distance_since_reversal
 from ident.model.model import Column
 from ident.model.regressor import cos_sin
 
@@ -251,7 +252,7 @@ class PassiveFriction(Effect):
 
 
 @dataclass(frozen=True, slots=True)
-class WarmUp(Effect):
+class WarmUp(FadingEffect):
     """τ = e^(−t/η) · (c_s · sign(q̇) + c_v · q̇);  c_s, c_v > 0: more friction while cold.
 
     Source: grease is stiff when cold, and the heat of the losses fills the joint's capacity with
@@ -265,25 +266,9 @@ class WarmUp(Effect):
     abscissa = Abscissa.TIME
     coefficients = (Column("dry", "Nm", least=0.0), Column("viscous", "Nm/(rad/s)", least=0.0))
 
-    time_constant_s: Annotated[float, Range(1e-2, 1e6)]  #: η, from half a run to many
-    #: 1 where t counts from the first run of the session, 0 where from the beginning of each run,
-    #: as after a power-on.
-    whole_session: Switch
-
-    def fits_in(self, runs: Sequence[Signals], axis: int) -> bool:
-        """Whether the friction fades while it is watched:
-        over the session, or over the longest run.
-        """
-        del axis
-        return self.time_constant_s <= watched_s(runs, whole_session=bool(self.whole_session))
-
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Columns, shape (2, k)."""
-        if self.whole_session:
-            time_s = signals.session_s
-        else:
-            time_s = signals.time_s
-        cold = np.exp(-time_s / self.time_constant_s)
+        cold = self.left(signals)
         v = signals.velocity_rad_s[axis]
         return np.stack((cold * np.sign(v), cold * v))
 

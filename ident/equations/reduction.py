@@ -109,9 +109,7 @@ def reduce_built(
     )
 
 
-def standard_equations(
-    model: Model, payloads: Sequence[Payload] = (), runs: Sequence[str] = ()
-) -> Equations:
+def standard_equations(model: Model, payloads: Sequence[Payload] = ()) -> Equations:
     """The unknowns before any regrouping: every standard parameter, and none of the payloads."""
     names = tuple(column.name for column in model.columns)
     count = len(names)
@@ -122,7 +120,7 @@ def standard_equations(
         columns=model.columns,
         payloads=tuple(payloads),
         payload_columns=((),) * len(payloads),
-        runs=tuple(runs),
+        runs=(),
     )
 
 

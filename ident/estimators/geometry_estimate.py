@@ -42,9 +42,9 @@ from ident.model.geometry import (
     base_places,
     encoder_delays,
     geometry_parameters,
+    unit_of,
     with_geometry,
 )
-from ident.model.geometry_derivatives import unit_of
 from ident.model.model import Model
 from ident.model.robot import JointKind, Robot
 

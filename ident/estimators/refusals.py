@@ -130,7 +130,7 @@ def with_channel_causes(runs: Sequence[RunChannels], axes: Sequence[str]) -> Ite
             PayloadUnseen,
         }
         if is_unexplained:
-            still = still_joint(runs, axes, "a fit that contradicts itself")
+            still = still_joint(runs, axes)
         else:
             still = None
         if still is None:

@@ -18,6 +18,7 @@ import numpy as np
 
 from ident.arrays import FloatArray
 from ident.errors import ModelError
+from ident.model.model import Model
 from ident.model.robot import Closure, Joint, JointKind, Place, Robot, skew
 
 DIRECTIONS = ("x", "y", "z")  #: Axes of the base
@@ -167,6 +168,24 @@ def with_geometry(robot: Robot, changes: Iterable[GeometryChange]) -> Robot:
             case _:
                 changed = _with_length(changed, parameter, one.change)
     return changed
+
+
+def model_with_geometry(model: Model, changes: Iterable[GeometryChange]) -> Model:
+    """Return the model of a robot with other zeros, lengths and places.
+
+    Raises:
+        ModelError: the robot has no such joint or link, or its loops do not close with them.
+    """
+    return replace(model, robot=with_geometry(model.robot, changes))
+
+
+def unit_of(model: Model, parameter: GeometryParameter) -> float:
+    """Return the size to compare a change with: a radian, or the size of the robot [m]."""
+    kinds = {joint.name: joint.kind for joint in model.robot.joints}
+    is_zero = parameter.kind is GeometryKind.ZERO
+    if is_zero and kinds[parameter.joint] is JointKind.REVOLUTE:
+        return 1.0
+    return model.assembly.size_m
 
 
 def _unknown(robot: Robot, parameter: GeometryParameter) -> ModelError:

@@ -126,18 +126,6 @@ class LinkPrior:
             directions.append(self.tolerance * np.column_stack(columns))
         return np.array(directions)
 
-    def drawn(self, rng: np.random.Generator) -> FloatArray:
-        """Links of a robot that the prior describes, shape (n, 10);
-        bodies that cannot exist are drawn again.
-        """
-        drawn: list[FloatArray] = []
-        for link, directions in zip(self.links, self.directions(), strict=True):
-            body = link + directions @ rng.standard_normal(10)
-            while np.linalg.eigvalsh(pseudo_inertia(body))[0] <= 0.0:
-                body = link + directions @ rng.standard_normal(10)
-            drawn.append(body)
-        return np.array(drawn)
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FullParameters:
@@ -157,7 +145,6 @@ class FullParameters:
     #: smallest one of each link's pseudo-inertia, as a share of its prior's, shape (n,)
     eigenvalues: FloatArray
     bounded: bool  #: the unbounded solution was no possible robot
-    variance_ratio: float  #: mean variance of the estimate over that of independent rows
     check: PriorCheck  #: whether data and prior agree
 
     @property
@@ -250,7 +237,7 @@ def full_parameters(
     """
     _require_full(system, prior)
     model = system.model
-    equations, ratio = _equations(system, estimate, prior)
+    equations = _equations(system, estimate, prior)
     gains = equations.gains
     own = equations.standard
     links = model.link_columns
@@ -294,7 +281,6 @@ def full_parameters(
         base_std=np.sqrt(np.diag(base_covariance)),
         eigenvalues=np.asarray(eigenvalues[:, 0]),
         bounded=is_bounded,
-        variance_ratio=ratio,
         check=check,
     )
 
@@ -398,8 +384,8 @@ def _variance_ratio(triangle: FloatArray, covariance: FloatArray) -> float:
     return ratio
 
 
-def _equations(system: System, estimate: Estimate, prior: LinkPrior) -> tuple[_Equations, float]:
-    """Rows of data and prior, and the ratio of variances by which the data are scaled."""
+def _equations(system: System, estimate: Estimate, prior: LinkPrior) -> _Equations:
+    """Rows of data and prior."""
     fixed = 0
     if estimate.gains_fixed:
         fixed = len(estimate.gains)
@@ -431,7 +417,7 @@ def _equations(system: System, estimate: Estimate, prior: LinkPrior) -> tuple[_E
         of_links[first:end, gains + columns] = whitening
         right.append(whitening @ link)
         first = end
-    equations = _Equations(
+    return _Equations(
         model=system.model,
         data=data,
         prior=np.concatenate((of_drives, of_links)),
@@ -441,7 +427,6 @@ def _equations(system: System, estimate: Estimate, prior: LinkPrior) -> tuple[_E
         covariance=covariance,
         gains=gains,
     )
-    return equations, ratio
 
 
 def _any_standard(system: System, estimate: Estimate) -> FloatArray:

@@ -387,7 +387,6 @@ class PhysicalParameters:
     model: Model  #: the declared model
     standard: FloatArray  #: χ_st, shape (c,)
     base: BaseParameters  #: grouping of the base parameters
-    identified: FloatArray  #: given values of the base parameters, shape (b,)
     #: base parameters of `standard`, shape (b,); those identified where a consistent set exists
     realised: FloatArray
     #: ‖Δτ‖/‖τ‖ of the realised against the identified torque on the given motion [%].
@@ -421,7 +420,6 @@ class PhysicalParameters:
             model=model,
             standard=standard,
             base=base,
-            identified=values,
             realised=base.grouping @ standard,
             torque_change_percent=change_percent,
             eigenvalues=np.asarray(eigenvalues[:, 0], dtype=np.float64),

@@ -33,11 +33,6 @@ class TimeToTarget:
     left_s: FloatArray
 
     @property
-    def is_reached(self) -> bool:
-        """Whether every gain is at its target."""
-        return bool(np.all(self.ratio <= 1.0))
-
-    @property
     def worst(self) -> int:
         """Index of the gain that is farthest from its target; the first of equals."""
         return int(np.argmax(self.ratio))

@@ -39,6 +39,7 @@ from ident.model.bodies import Payload
 from ident.model.model import JOINT_COLUMNS, Model
 from ident.physical.full_parameters import FullParameters, LinkPrior, RestsOn, full_parameters
 from ident.physical.physical import urdf_links
+from tests.ident.physical.drawn_links import drawn_links
 from tests.studies.direct_cell import MOVING, RawRun, run_of
 from tests.studies.fingerprint import digest, digest_of_source, finish, is_finished, made_once
 from tests.studies.followed_cell import follow, point_to_point
@@ -159,7 +160,7 @@ def true_standard(spec: CellSpec, model: Model) -> FloatArray:
 
 def priors(links: FloatArray, tolerance: float, rng: np.random.Generator) -> dict[str, LinkPrior]:
     """Return a right prior of true links, shape (n, 10), and wrong ones, by KINDS."""
-    right = LinkPrior(links, tolerance).drawn(rng)
+    right = drawn_links(LinkPrior(links, tolerance), rng)
     even = np.ones((len(links), 1))
     either = rng.choice((1.0 - OFF, 1.0 + OFF), size=(len(links), 1))
     scales = {

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from datetime import UTC, datetime
 
 from daq.config.policy import ApplyPolicy
 from daq.writeback.gates import fit, logs, target
 from daq.writeback.gates.gate import Gate, GateContext, Refusal
-from daq.writeback.request import Edit, GateFinding, Request
-from ident.calibration import Calibration
+from daq.writeback.request import GateFinding
 
 _LIMITS = ApplyPolicy()
 
@@ -126,27 +124,6 @@ GATES: tuple[GateRow, ...] = (
         f"`max_nameplate_percent: {_LIMITS.max_nameplate_percent:g}`",
     ),
 )
-
-
-OF_CALIBRATION = (
-    fit.description,
-    fit.finite_errors,
-    fit.holdout_motion,
-    fit.effect,
-    logs.partial,
-    logs.losses,
-)
-"""Checks that need neither the cell, its policy nor a target."""
-
-
-def check_calibration(calibration: Calibration) -> tuple[GateFinding, ...]:
-    """Check what refuses a calibration on every cell and target; none where that passes."""
-    request = Request(calibration, datetime.now(UTC))
-    context = GateContext(request, Edit(subject="", before=None, after=b""))
-    found: list[GateFinding] = []
-    for check in OF_CALIBRATION:
-        found.extend(check(context))
-    return tuple(found)
 
 
 def check_gates(context: GateContext) -> tuple[Refusal, ...]:

@@ -76,8 +76,8 @@ def test_a_file_of_drawings_is_whole_and_the_same_twice(kind: str, panels: int) 
 
 
 def test_the_picture_of_the_gains_is_whole_and_the_same_twice() -> None:
-    drawn = plot_gains(demo_calibration().gains, dict.fromkeys(AXES, 20.0), title="demo")
-    expected = plot_gains(demo_calibration().gains, dict.fromkeys(AXES, 20.0), title="demo")
+    drawn = plot_gains(demo_calibration().gains, dict.fromkeys(AXES, 20.0))
+    expected = plot_gains(demo_calibration().gains, dict.fromkeys(AXES, 20.0))
     assert drawn == expected
     assert matplotlib.image.imread(io.BytesIO(drawn)).shape[1] > 900
 

@@ -23,7 +23,14 @@ from daq.report.comparison import without_controller
 from daq.report.document import json_tree
 from daq.report.gains import encoder_text
 from daq.workflow import fit as fitting
-from daq.workflow.fit import Fit, calibration_of, close_loop, fit, with_corrected_geometry
+from daq.workflow.fit import (
+    Fit,
+    _with_geometry_of_encoders,
+    _with_uncertain_geometry,
+    calibration_of,
+    close_loop,
+    fit,
+)
 from daq.workflow.geometry_diagnoses import calibrated_model, encoder_misfit_of, geometry_diagnoses
 from ident.data.dataset import differentiate
 from ident.data.run import Run
@@ -52,6 +59,13 @@ ZERO = GeometryParameter(GeometryKind.ZERO, "crank-2")
 ROD = GeometryParameter(GeometryKind.LENGTH, "elbow-3", "arm-3")
 RATE_HZ = 250.0
 COUNT_RAD = 2.0 * np.pi / (65536 * 5)
+
+
+def with_corrected_geometry(start: Fit) -> Fit:
+    """The fit with the zeros and lengths that the encoders show, as a search begins with it."""
+    if start.is_corrected:
+        return start
+    return _with_uncertain_geometry(_with_geometry_of_encoders(start))
 
 
 def _positions(seed: int) -> FloatArray:

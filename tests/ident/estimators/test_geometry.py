@@ -22,8 +22,8 @@ from ident.model.geometry import (
     base_places,
     encoder_delays,
     geometry_parameters,
+    model_with_geometry,
 )
-from ident.model.geometry_derivatives import model_with_geometry
 from tests.ident.closed_recordings import RATE_HZ, axis_positions
 from tests.ident.mechanisms import FIVE_BAR, PLANAR
 

@@ -19,6 +19,7 @@ from ident.estimators.method import Method
 from ident.model.bodies import LINK_PARAMETERS, Body, body_of, link_parameters, pseudo_inertia
 from ident.model.model import DriveTrain, Model
 from ident.physical.full_parameters import FullParameters, LinkPrior, RestsOn, full_parameters
+from tests.ident.physical.drawn_links import drawn_links
 from tests.ident.recordings import CONDITIONING, MOUNTED, Truth, record, three_axes_truth
 
 FloatArray = NDArray[np.float64]
@@ -116,7 +117,7 @@ def test_sigma_is_true_and_nothing_is_bent(small: Evidence, small_truth: Truth) 
     count = 60
     for _ in range(count):
         link_prior = LinkPrior(_links(small_truth), 0.1)
-        links = link_prior.drawn(rng)
+        links = drawn_links(link_prior, rng)
         estimate = _with_errors(exact, rng)
         prior = LinkPrior(links, 0.1)
         full = full_parameters(found.system, estimate, prior)
@@ -204,7 +205,7 @@ def test_no_prior_decides_where_the_tolerance_is_wide_and_the_data_are_sharp(
 ) -> None:
     """Without noise, base parameters and gains are the data's whatever the prior says."""
     link_prior = LinkPrior(_links(truth), 0.3)
-    links = link_prior.drawn(np.random.default_rng(4))
+    links = drawn_links(link_prior, np.random.default_rng(4))
     prior = LinkPrior(links, 0.3)
     full = full_parameters(clean_found.system, clean_found.estimate, prior)
     base = clean_found.system.base
