@@ -207,9 +207,7 @@ def test_a_second_device_has_50_ms_to_answer_after_a_refusal(delay_ms: int, word
     bus = LateBus((node,), clock)
     axes = (Axis("J1", 1, PROFILE),)
     policy = SdoPolicy(0.02, 2)
-    network = CanopenNetwork(
-        ADDRESS, axes, policy=policy, clock=clock, opener=lambda address: bus
-    )
+    network = CanopenNetwork(ADDRESS, axes, policy=policy, clock=clock, opener=lambda address: bus)
     vendor = can.Message(
         arbitration_id=0x581, is_extended_id=False, data=bytes.fromhex("431810019a020000")
     )
