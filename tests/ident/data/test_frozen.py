@@ -1,7 +1,7 @@
 """Stretches in which a channel keeps one number, each rule at its limit: how long, how far it
 jumps, what else moves.
 
-A sample is a millisecond, and a position moves by a hundred counts in it.
+A sample is a millisecond, and a position moves by two hundred counts in it.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from ident.data.glitches import Readings
 FloatArray = NDArray[np.float64]
 RATE_HZ = 1000.0
 COUNT = 0.01
-STEP = 1.0
+STEP = 2.0
 SAMPLES = 2000
 BEGIN = 700
 
 
-def _readings(values: FloatArray, every: int = 1) -> Readings:
+def _readings(values: FloatArray, every: int = 1, count: float = COUNT) -> Readings:
     """Readings of every so many samples."""
     sample = every * np.arange(len(values))
-    return Readings(values=values, sample=sample, rate_hz=RATE_HZ, count=COUNT)
+    return Readings(values=values, sample=sample, rate_hz=RATE_HZ, count=count)
 
 
 def _way(seconds: float = SAMPLES / RATE_HZ) -> FloatArray:
@@ -51,7 +51,7 @@ def test_a_position_is_frozen_beyond_50_ms(samples: int, found: list[list[int]])
     assert stretches.tolist() == found
 
 
-@pytest.mark.parametrize(("jump", "is_frozen"), [(3.0, False), (3.09, False), (3.11, True)])
+@pytest.mark.parametrize(("jump", "is_frozen"), [(6.0, False), (6.09, False), (6.11, True)])
 def test_a_frozen_position_jumps_by_three_usual_steps_and_ten_counts(
     jump: float, is_frozen: bool
 ) -> None:
@@ -60,8 +60,27 @@ def test_a_frozen_position_jumps_by_three_usual_steps_and_ten_counts(
 
 
 def test_a_frozen_position_may_jump_back() -> None:
-    stretches = frozen_position(_readings(_frozen_way(80, -3.2)))
+    stretches = frozen_position(_readings(_frozen_way(80, -6.2)))
     assert stretches.tolist() == [[BEGIN, BEGIN + 80]]
+
+
+def test_a_position_that_is_frozen_from_the_start_is_found() -> None:
+    values = _way()
+    values[:80] = values[79]
+    values[80:] += 20.0
+    assert frozen_position(_readings(values)).tolist() == [[0, 80]]
+
+
+def test_a_position_that_does_not_go_on_has_no_jump() -> None:
+    values = _way()
+    values[BEGIN:] = values[BEGIN]
+    assert frozen_position(_readings(values)).shape == (0, 2)
+
+
+def test_a_frozen_position_may_differ_by_rounding() -> None:
+    values = _frozen_way(80, 80.0)
+    values[BEGIN + 1 : BEGIN + 80 : 2] += 1e-9
+    assert frozen_position(_readings(values)).tolist() == [[BEGIN, BEGIN + 80]]
 
 
 def test_a_stretch_is_given_in_samples_where_readings_are_held() -> None:
@@ -133,6 +152,37 @@ def test_others_must_move_by_a_fiftieth_of_their_range(share: float, is_frozen: 
     assert bool(len(stretches)) is is_frozen
 
 
+@pytest.mark.parametrize(("height", "is_frozen"), [(0.985, True), (0.99, False)])
+def test_a_frozen_motor_stops_three_times_as_abruptly_as_it_turns(
+    height: float, is_frozen: bool
+) -> None:
+    # In the 10 ms before a height of A sin φ it goes A (sin φ − sin(φ − 0.02 π)): 0.0128 A before
+    # 0.985 A, and 0.0109 A before 0.99 A. At its turns that way changes by 0.0039 A in 10 ms.
+    values = _swinging()
+    stop = 1000 + round(1000.0 * np.arcsin(height) / (2.0 * np.pi))
+    values[stop:] = values[stop]
+    stretches = frozen_to_the_end(_readings(values, count=1e-4), _others())
+    assert bool(len(stretches)) is is_frozen
+
+
+def test_a_motor_of_a_coarse_encoder_stops_by_more_than_ten_counts() -> None:
+    for count, is_frozen in ((0.04, True), (0.06, False)):
+        # It stops from 0.63 in 10 ms; three times its largest other change is 0.12.
+        stretches = frozen_to_the_end(_readings(_stopped(_swinging()), count=count), _others())
+        assert bool(len(stretches)) is is_frozen
+
+
+def test_a_frozen_end_is_given_in_samples_where_readings_are_held() -> None:
+    others = np.repeat(_others(), 2, axis=0)
+    stretches = frozen_to_the_end(_readings(_stopped(_swinging()), every=2), others)
+    assert stretches.tolist() == [[2 * STOP, 2 * SAMPLES - 1]]
+
+
+def test_without_another_motor_nothing_shows_that_the_robot_goes_on() -> None:
+    alone = np.zeros((SAMPLES, 0))
+    assert frozen_to_the_end(_readings(_stopped(_swinging())), alone).shape == (0, 2)
+
+
 def test_any_of_the_others_is_enough() -> None:
     others = np.column_stack((np.zeros(SAMPLES), _others()))
     stretches = frozen_to_the_end(_readings(_stopped(_swinging())), others)
@@ -169,6 +219,53 @@ def test_a_position_beyond_the_end_of_its_range_is_found() -> None:
     assert found.tolist() == [[84, 417], [1084, 1417]]
     below = clipped_position(_clipped(-5.0, 99.0))
     assert below.tolist() == [[584, 917], [1584, 1917]]
+
+
+@pytest.mark.parametrize(("count", "is_clipped"), [(0.038, True), (0.042, False)])
+def test_a_clipped_position_stops_more_abruptly_than_it_turns_and_by_ten_counts(
+    count: float, is_clipped: bool
+) -> None:
+    # 0.516 in 10 ms before and after; three times its largest usual change is 0.118.
+    values = np.clip(_swinging(), -99.0, 5.0)
+    stretches = clipped_position(_readings(values, count=count))
+    assert bool(len(stretches)) is is_clipped
+
+
+@pytest.mark.parametrize("is_reversed", [False, True])
+def test_a_clipped_position_is_abrupt_at_one_end_at_least(is_reversed: bool) -> None:
+    # At 10 units/s to its limit, 0.3 s there, and off with 20 units/s².
+    time_s = np.arange(1000) / RATE_HZ
+    there = 10.0 * time_s[:301]
+    back = 3.0 - 10.0 * time_s**2
+    values = np.concatenate((there, np.full(299, 3.0), back, np.full(100, back[-1])))
+    expected = [[300, 601]]
+    if is_reversed:
+        values = values[::-1].copy()
+        expected = [[len(values) - 601, len(values) - 300]]
+    # Where it stands at its other end, it stops as abruptly: that is cut off.
+    inside = values[:-140] if not is_reversed else values[140:]
+    if is_reversed:
+        expected = [[first - 140, end - 140] for first, end in expected]
+    assert clipped_position(_readings(inside, count=1e-4)).tolist() == expected
+
+
+def test_a_recording_may_begin_and_end_beyond_the_range() -> None:
+    # A cosine begins at its largest value, and ends there after two periods.
+    time_s = np.arange(SAMPLES) / RATE_HZ
+    values = np.clip(10.0 * np.cos(2.0 * np.pi * time_s), -99.0, 5.0)
+    # cos⁻¹ 0.5 is a sixth of the period.
+    found = clipped_position(_readings(values))
+    assert found.tolist() == [[0, 167], [834, 1167], [1834, 2000]]
+
+
+@pytest.mark.parametrize("is_reversed", [False, True])
+def test_a_motor_that_rests_at_an_end_of_the_recording_is_not_clipped(is_reversed: bool) -> None:
+    # 0.3 s of rest, and off with 20 units/s².
+    time_s = np.arange(1000) / RATE_HZ
+    values = np.concatenate((np.zeros(300), 10.0 * time_s**2))
+    if is_reversed:
+        values = values[::-1].copy()
+    assert clipped_position(_readings(values)).shape == (0, 2)
 
 
 def test_stops_at_two_places_are_no_end_of_a_range() -> None:
@@ -221,6 +318,27 @@ def test_a_current_is_frozen_where_its_motor_moves_by_a_fiftieth_of_its_range(
     assert stretches.tolist() == ([[BEGIN, BEGIN + 200]] if is_frozen else [])
 
 
+def test_a_motor_may_move_at_the_last_frozen_sample_alone() -> None:
+    motor = np.zeros(SAMPLES)
+    for moves_at, is_frozen in ((BEGIN + 199, True), (BEGIN + 200, False)):
+        motor[:] = 0.0
+        motor[moves_at:] = 1.0
+        stretches = frozen_current(_frozen_current(200), motor)
+        assert bool(len(stretches)) is is_frozen
+
+
+@pytest.mark.parametrize(("run", "is_frozen"), [(3, True), (5, False)])
+def test_a_current_is_noisy_where_a_quarter_of_its_changes_turn_back(
+    run: int, is_frozen: bool
+) -> None:
+    # It goes up by so many steps, and down by as many.
+    place = np.mod(np.arange(SAMPLES), 2 * run)
+    current = np.minimum(place, 2 * run - place).astype(np.float64)
+    current[BEGIN : BEGIN + 200] = 1.5
+    stretches = frozen_current(_readings(current), _way())
+    assert bool(len(stretches)) is is_frozen
+
+
 def test_without_any_motion_no_current_is_frozen() -> None:
     assert frozen_current(_frozen_current(200), np.zeros(SAMPLES)).shape == (0, 2)
 
@@ -233,7 +351,7 @@ def test_a_current_at_its_largest_value_is_not_frozen_but_limited() -> None:
 def test_a_current_that_is_often_constant_is_frozen_beyond_ten_such_times() -> None:
     # Each number stays for 15 samples.
     current = np.repeat(_noisy_current(), 15)[:SAMPLES]
-    for samples, is_frozen in ((135, False), (165, True)):
+    for samples, is_frozen in ((149, False), (150, True)):
         changed = current.copy()
         changed[705 : 705 + samples] = 0.25
         stretches = frozen_current(_readings(changed), _way())
