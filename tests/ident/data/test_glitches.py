@@ -235,13 +235,14 @@ def test_a_counter_goes_on_by_its_range_within_a_twentieth_more_often_than_not(
 
 
 def test_one_step_is_no_counter_that_wraps() -> None:
-    values = 0.0005 * np.arange(SAMPLES)
+    values = 0.0005 * np.arange(SAMPLES, dtype=np.float64)
     values[500:] -= 0.5
     assert _range(values) is None
 
 
 def test_equal_steps_that_lead_away_are_no_counter() -> None:
-    values = 0.001 * np.arange(SAMPLES) + 0.3 * (np.arange(SAMPLES) // 100)
+    sample = np.arange(SAMPLES, dtype=np.float64)
+    values = 0.001 * sample + 0.3 * np.floor(sample / 100.0)
     assert len(find_jumps(_readings(values), is_position=True).step) == 9
     assert _range(values) is None
 
