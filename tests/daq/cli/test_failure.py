@@ -141,6 +141,18 @@ def test_a_refused_connection_names_the_command_that_starts_a_cell(
     assert "Errno" not in said
 
 
+def test_texts_of_an_error_stand_under_one_another_also_in_further_lines(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    error = DataError("a.mcap", found="x\ny", expected="z", remedy="w")
+    show_failure(ErrorParts.of(error), json_wanted=False)
+    lines = capsys.readouterr().err.splitlines()
+    assert "found:    x" in lines
+    assert "          y" in lines
+    assert "expected: z" in lines
+    assert "do:       w" in lines
+
+
 def test_a_program_gets_one_object_a_line(capsys: pytest.CaptureFixture[str]) -> None:
     error = DataError("a\nb\udcff", found="x", expected="y", remedy="z")
     error.add_note("kept: c.mcap")

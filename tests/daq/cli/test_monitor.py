@@ -617,3 +617,31 @@ def test_each_reading_publishes_the_load_of_the_buses(
     for load_of_bus in loads:
         for load in load_of_bus.values():
             assert 0.0 < load < 0.06
+
+
+def test_a_terminal_shows_one_reading_after_another_until_ctrl_c(
+    quiet_cell_file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    ampere = (0.002,) * 6
+    waiting = []
+    for current_raw in (500, 1000):
+        reading = _reading([0] * 6)
+        axes = tuple(replace(axis, current_raw=current_raw) for axis in reading.axes)
+        reading = replace(reading, axes=axes)
+        waiting.append(WatchedCell(reading, joint_positions(CELL, reading), ampere, ()))
+
+    def read(*_: object) -> WatchedCell:
+        if not waiting:
+            raise KeyboardInterrupt
+        return waiting.pop(0)
+
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    monkeypatch.setenv("COLUMNS", "120")
+    monkeypatch.setattr(CellWatch, "listen", lambda *_: None)
+    monkeypatch.setattr(CellWatch, "read", read)
+    assert run_verb("monitor", quiet_cell_file) == ExitCode.OK
+    shown = capsys.readouterr().out
+    assert shown.count("+1.000 A") == 6
+    # The last reading is drawn once more when the display ends.
+    assert shown.count("+2.000 A") >= 6
+    assert shown.index("+1.000 A") < shown.index("+2.000 A")

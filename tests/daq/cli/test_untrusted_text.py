@@ -4,8 +4,10 @@ in tables, pictures and on the terminal they are only shown.
 
 from __future__ import annotations
 
+import codecs
 import csv
 import io
+import json
 import warnings
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -13,10 +15,11 @@ from itertools import chain
 from pathlib import Path
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.console import Console
 
+from daq.cli.app import _spelled
 from daq.jobs.cell_fit import Failure, Summary
 from daq.jobs.fleet import FIRST_COLUMNS, FleetRow, fleet_csv, fleet_report
 from daq.ledger.ledger import read_history
@@ -149,6 +152,20 @@ def test_a_unit_neither_commands_the_terminal_nor_is_markup(unit: str, tmp_path:
 def test_terminal_text_has_no_control_characters(text: str) -> None:
     assert terminal_text(text).plain.isprintable()
     assert terminal_lines(text).replace("\n", "").replace("\t", "").isprintable()
+
+
+@given(st.text("aσ±€漢🤖 ", max_size=8))
+@settings(max_examples=20)
+def test_what_an_output_lacks_is_spelled_so_that_json_reads_it_as_it_was(text: str) -> None:
+    codecs.register_error("spelled in tests", _spelled)
+    shown = text.encode("ascii", "spelled in tests").decode("ascii")
+    assert json.loads(f'"{shown}"') == text
+
+
+def test_one_character_that_an_output_lacks_is_spelled_alone() -> None:
+    codecs.register_error("spelled in tests", _spelled)
+    shown = "5 ± 1 A, σ".encode("latin-1", "spelled in tests")
+    assert shown == b"5 \xb1 1 A, \\u03c3"
 
 
 def test_characters_are_spelled_as_python_writes_them() -> None:

@@ -18,6 +18,7 @@ from daq.documents.calibration_file import load_calibration, save_calibration
 from daq.errors import CalibrationUnreadable
 from daq.workflow.validate import (
     DataUse,
+    _masses,
     conditioning_of,
     together,
     validate,
@@ -248,3 +249,9 @@ def test_a_run_without_the_temperature_that_an_effect_needs_is_warned_of(
     warn_without_temperature(calibration, "monday", bare_temperature_c)
     warn_without_temperature(demo_calibration(), "monday", None)
     assert not caplog.records
+
+
+def test_what_keeps_rows_from_being_weighed_is_said_of_every_calibration() -> None:
+    calibrations = {"first": demo_calibration(), "second": demo_calibration()}
+    masses = _masses(calibrations, "no rows without load", 4.59)
+    assert masses == {"first": "no rows without load", "second": "no rows without load"}

@@ -12,7 +12,7 @@ import can
 import pytest
 
 from drivers.canopen.link import NmtState
-from drivers.canopen.network import CanopenNetwork
+from drivers.canopen.network import Bounds, CanopenNetwork
 from drivers.canopen.sdo import SdoPolicy
 from drivers.errors import (
     POWERED,
@@ -167,6 +167,62 @@ def test_a_missing_node_is_named_with_those_that_answered() -> None:
     ):
         network.prepare()
     assert missing.value.node_ids == (2,)
+
+
+def test_nodes_have_a_second_to_answer_where_nothing_else_is_said() -> None:
+    network, bus = cell(1)
+    network.bounds = Bounds()
+    bus.tamper = lambda _: ()
+    with network:
+        begun_ns = bus.clock.now_ns
+        with pytest.raises(NodeMissing, match=r"did not answer within 1 s"):
+            network.check_identities()
+        assert bus.clock.now_ns - begun_ns == pytest.approx(1e9, abs=5e6)
+
+
+class LateBus(ScriptedBus):
+    """A bus on which one frame comes at a time of its own.
+
+    Attributes:
+        late: the frame, and when it comes [ns].
+    """
+
+    late: tuple[int, can.Message] | None = None
+
+    def _beat(self) -> None:
+        super()._beat()
+        if self.late is None:
+            return
+        at_ns, message = self.late
+        if self.clock.now_ns >= at_ns:
+            self.late = None
+            self.inject(message)
+
+
+@pytest.mark.parametrize(
+    ("delay_ms", "words"), [(45, "two have it"), (60, r"1018h:01 \(identity\) refused")]
+)
+def test_a_second_device_has_50_ms_to_answer_after_a_refusal(delay_ms: int, words: str) -> None:
+    clock = FakeClock()
+    node = ScriptedNode(1)
+    del node.objects[0x1018, 1]
+    bus = LateBus((node,), clock)
+    axes = (Axis("J1", 1, PROFILE),)
+    policy = SdoPolicy(0.02, 2)
+    network = CanopenNetwork(ADDRESS, axes, policy=policy, clock=clock, opener=lambda address: bus)
+    vendor = can.Message(
+        arbitration_id=0x581, is_extended_id=False, data=bytes.fromhex("431810019a020000")
+    )
+
+    def answer_again(message: can.Message) -> tuple[can.Message, ...]:
+        is_refusal = message.arbitration_id == 0x581 and message.data[0] == 0x80
+        if is_refusal and bus.late is None:
+            bus.late = (clock.now_ns + delay_ms * 1_000_000, vendor)
+        return (message,)
+
+    bus.tamper = answer_again
+    with network, pytest.raises(SetupRefused, match=words):
+        network.check_identities()
 
 
 @pytest.mark.parametrize(

@@ -326,3 +326,30 @@ def test_sync_goes_out_on_schedule_while_frames_are_waited_for() -> None:
     bus.shutdown()
     steps = {after - before for before, after in zip(bus.sent_ns, bus.sent_ns[1:], strict=False)}
     assert steps == {PERIOD_NS}
+
+
+class BeatingTimeline(Timeline):
+    """A timeline that counts the heartbeats of the recorder, whose node id is 127."""
+
+    beats = 0
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        if msg.arbitration_id == 0x77F:
+            self.beats += 1
+        super().send(msg, timeout)
+
+
+def test_our_heartbeat_goes_on_while_sync_comes_back() -> None:
+    network, scripted = cell()
+    clock = scripted.clock
+    timeline = BeatingTimeline(clock, [[1000] * CYCLES, [1000] * CYCLES])
+    network.link._bus = timeline
+    stream = SyncStream(network, TimedSync(PERIOD_NS, 0, clock))
+    begun_ns = clock.now_ns
+    network.link.start_heartbeat(127, 3)
+    for _ in range(CYCLES):
+        stream.advance()
+    passed_ms = (clock.now_ns - begun_ns) / 1e6
+    timeline.shutdown()
+    assert passed_ms > 10.0
+    assert timeline.beats == pytest.approx(passed_ms / 3.0, abs=1.0)

@@ -15,6 +15,7 @@ from ident.discovery.evidence import Evidence, gather
 from ident.equations.linearisation import (
     MIN_MOVES_TO_LEAVE_OUT,
     Jacobian,
+    Linearisation,
     _sums_of_motors,
     independent_blocks,
     jackknife_covariance,
@@ -72,6 +73,44 @@ def test_a_jacobian_in_parts_is_the_whole_one() -> None:
     chosen = np.array([1, 3, 4])
     assert np.array_equal(jacobian.columns(chosen), whole[:, chosen])
     assert jacobian.only(chosen) @ step[chosen] == pytest.approx(whole[:, chosen] @ step[chosen])
+
+
+def _lines(motor: list[int], cluster: list[int], source: list[int]) -> Linearisation:
+    """Rows of two motors without any unknown."""
+    rows = len(motor)
+    nothing = np.zeros((0, rows))
+    return Linearisation(
+        jacobian=Jacobian((nothing,), (np.zeros(0, dtype=np.int64),), 0),
+        residual=np.zeros(rows),
+        current=np.ones(rows),
+        motor=np.array(motor),
+        cluster=np.array(cluster),
+        source=np.array(source),
+        gamma=np.array([0.5, 0.2]),
+        noise=np.array([0.1, 0.3]),
+        free=np.zeros(0, dtype=np.int64),
+        scale=np.zeros(0),
+    )
+
+
+def test_clusters_and_rows_of_a_motor_are_counted_over_all_motors() -> None:
+    # Motor 1 has no row in cluster 2, and motor 2 none in cluster 0.
+    lines = _lines(motor=[0, 0, 0, 1, 1], cluster=[0, 0, 1, 1, 2], source=[0, 2, 4, 5, 7])
+    assert lines.cluster_count == 3
+    run_of_row = np.array([3, 3, 3, 3, 8, 8, 8, 9])
+    assert lines.of_clusters(run_of_row).tolist() == [3, 8, 9]
+    assert [lines.rows_of(motor) for motor in (0, 1)] == [slice(0, 3), slice(3, 5)]
+    assert [lines.shown(motor) for motor in (0, 1)] == [3.0, 2.0]
+
+
+def test_what_internal_preload_hides_is_not_shown() -> None:
+    # T_D = P D⁻¹ with D the diagonal of σ/γ: P_ii is 1/2 for both motors of one joint.
+    lines = _lines(motor=[0, 0, 1], cluster=[0, 0, 0], source=[0, 1, 1])
+    projection = np.full((2, 2), 0.5)
+    per_row = projection / (lines.noise / lines.gamma)
+    lines = replace(lines, transform=np.stack((per_row, per_row)))
+    assert lines.shown(0) == pytest.approx(1.0)
+    assert lines.shown(1) == pytest.approx(0.5)
 
 
 def test_a_shift_is_that_of_the_fit_without_the_cluster() -> None:

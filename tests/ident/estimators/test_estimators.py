@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from ident.data.run import Run
 from ident.equations.system import require_distinct
 from ident.errors import DataUnfit, PayloadMissing, RankDeficient
+from ident.estimators import maximum_likelihood
 from ident.estimators.estimate import Estimate, Identification
 from ident.estimators.identify import estimate_with, identify
 from ident.estimators.least_squares import Scaling, tls, wls
@@ -158,6 +159,21 @@ def test_loaded_runs_alone_are_rank_deficient(truth: Truth, clean_runs: tuple[Ru
     with pytest.raises(RankDeficient, match="without load too") as caught:
         _fit(truth, clean_runs[1:])
     assert any(name.endswith(":a") for name in caught.value.unknowns)
+
+
+def test_gains_that_no_linear_estimate_has_are_named(
+    clean_found: Identification, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def without_the_third(*_: object) -> Estimate:
+        gains = GAINS.copy()
+        gains[2] = 0.0
+        return replace(clean_found.estimate, gains=gains)
+
+    monkeypatch.setattr(maximum_likelihood, "wls", without_the_third)
+    monkeypatch.setattr(maximum_likelihood, "tls", without_the_third)
+    with pytest.raises(RankDeficient, match="no linear estimate gives every gain") as caught:
+        ml(clean_found.system)
+    assert caught.value.unknowns == tuple(f"gain {motor}" for motor in range(1, 7))
 
 
 def test_a_mounting_has_one_payload(truth: Truth) -> None:

@@ -17,7 +17,7 @@ import pytest
 import ident
 from ident.arrays import FloatArray
 from ident.planning.effort import EFFORT_MARGIN, effort_shares
-from ident.planning.moves import _search_of
+from ident.planning.moves import DWELL_S, FEWEST_MOVES, MAX_TRIES, _random_moves, _search_of
 from tests.ident.mechanisms import FIVE_BAR
 
 EXAMPLE = SimpleNamespace(
@@ -375,3 +375,74 @@ WRONG: list[tuple[str, Call, str]] = [
 def test_what_no_plan_can_be_made_of_is_refused(model: ident.Model, call: Call, words: str) -> None:
     with pytest.raises(ident.IdentificationError, match=words):
         call(model)
+
+
+class _Search:
+    """What random moves ask: targets one after another, 2 s a move at full speed, and of every
+    second move more torque than there is.
+    """
+
+    def __init__(self, refused: Callable[[int], bool]) -> None:
+        self.asked = 0
+        self.refused = refused
+        self.durations_s: list[float] = []
+
+    def random_target(
+        self, rng: np.random.Generator, start_rad: FloatArray | None = None
+    ) -> FloatArray:
+        return rng.uniform(-1.0, 1.0, 2)
+
+    def fastest_s(self, start_rad: FloatArray, end_rad: FloatArray) -> float:
+        return 2.0
+
+    def information(
+        self, start_rad: FloatArray, end_rad: FloatArray, move_s: float
+    ) -> FloatArray | None:
+        self.asked += 1
+        if self.refused(self.asked):
+            return None
+        self.durations_s.append(move_s)
+        return np.eye(2)
+
+
+def _filled(search: _Search, duration_s: float) -> Any:
+    draw: Any = _random_moves
+    return draw(search, np.random.default_rng(5), duration_s)
+
+
+def test_moves_that_no_drive_can_make_are_drawn_again() -> None:
+    duration_s = 200.0
+    search = _Search(lambda asked: asked % 2 == 0)
+    draft = _filled(search, duration_s)
+    moves = len(draft.move_s)
+    used_s = sum(draft.move_s) + DWELL_S * moves
+    # The longest move takes 2 s / 0.3.
+    assert duration_s - 2.0 / 0.3 - DWELL_S < used_s <= duration_s
+    assert list(draft.move_s) == search.durations_s[:moves]
+    assert (len(draft.target_rad), len(draft.information)) == (moves + 1, moves)
+
+
+@pytest.mark.parametrize(("in_turn", "is_enough"), [(MAX_TRIES - 1, True), (MAX_TRIES, False)])
+def test_moves_are_drawn_so_often_from_one_place_and_no_more(in_turn: int, is_enough: bool) -> None:
+    # After the third move, so many in turn are refused.
+    search = _Search(lambda asked: 3 < asked <= 3 + in_turn)
+    if is_enough:
+        draft = _filled(search, 200.0)
+        assert len(draft.move_s) >= FEWEST_MOVES
+        return
+    with pytest.raises(ident.PlanUnfit, match="found room for 3 moves in 200 s"):
+        _filled(search, 200.0)
+
+
+def test_a_move_takes_as_long_as_least_jerk_within_the_slowest_limit(model: ident.Model) -> None:
+    gains = np.array(EXAMPLE.NAMEPLATE_NM_A)
+    search = _search_of(model, LIMITS, EXAMPLE.DISC, gains, None, ident.Conditioning())
+    start = np.array([-1.0, 0.5, 0.0])
+    for way in ([2.0, 0.1, 0.1], [0.0, 0.05, 0.0], [0.1, -0.3, 2.2]):
+        end = start + np.array(way)
+        move_s = search.fastest_s(start, end)
+        planned = ident.PlannedMoves(np.array([start, end]), np.array([move_s]), 0.1, np.ones(3))
+        _, motion = planned.motion(20_000.0)
+        speed = np.abs(motion.velocity_rad_s).max(axis=0) / LIMITS.velocity
+        acceleration = np.abs(motion.acceleration_rad_s2).max(axis=0) / LIMITS.acceleration
+        assert max(speed.max(), acceleration.max()) == pytest.approx(1.0, rel=1e-5)
