@@ -78,6 +78,16 @@ def test_encodings(tmp_path: Path, encoding: str, bom: bytes, remark: str) -> No
     assert [remark in text and text.startswith("run.csv: ") for text in table.remarks] == expected
 
 
+def test_a_european_export_is_read(tmp_path: Path) -> None:
+    """Semicolons, decimal commas, Windows-1252, CRLF and umlauts at once."""
+    rows = [row.replace(",", ";").replace(".", ",") for row in ROWS]
+    text = "\r\n".join(("Größe [°];Strom [µA]", *rows)) + "\r\n"
+    columns = ("Größe [°]", "Strom [µA]")
+    table = _read(tmp_path, text.encode("cp1252"), columns, delimiter=";", decimal=",")
+    np.testing.assert_array_equal(table.values, VALUES)
+    assert table.remarks == ("run.csv: no UTF-8; read as Windows-1252",)
+
+
 @pytest.mark.parametrize(
     ("data", "found"),
     [
