@@ -578,6 +578,8 @@ def _check_shape(file: CsvLines, named: int) -> None:
     first_end = file.fields(file.rows[0])[-1]
     last_end = file.fields(file.rows[last])[-1]
     lacks_last_field = first_end and not last_end
+    if lacks_last_field:
+        _require_row(file, last)
     if wrong.size or lacks_last_field:
         excerpt = file.rows[last][-EXCERPT_CHARACTERS:]
         keep = _keep_to(file, last)
@@ -591,18 +593,37 @@ def _check_shape(file: CsvLines, named: int) -> None:
 
 
 def _require_row(file: CsvLines, row: int) -> None:
-    """Refuse a line without any number: an empty one, a comment,
-    a remark of the program that wrote it.
+    """Refuse a line without any number, or with a word where rows begin with a number:
+    an empty one, a comment, a remark of the program that wrote it.
     """
     text = file.rows[row]
     numbers = (file.to_number(field) for field in file.fields(text))
-    is_row = any(map(math.isfinite, numbers))
+    has_number = any(map(math.isfinite, numbers))
+    is_row = has_number and not begins_with_word(file, row)
     is_comment = text.lstrip().startswith(COMMENT_SIGNS)
     has_letters = any(character.isalpha() for character in text)
     # A last line of one torn field may be the begin of a number.
     is_torn = row == len(file.rows) - 1 and not has_letters
     if (is_row and not is_comment) or is_torn:
         return
+    raise no_row(file, row)
+
+
+def begins_with_word(file: CsvLines, row: int) -> bool:
+    """Whether a line begins with a word where the first row begins with a number:
+    `Samples,1000` of the program that wrote the file.
+    """
+    first, *_ = file.fields(file.rows[row])
+    usual, *_ = file.fields(file.rows[0])
+    if not math.isfinite(file.to_number(usual)) or first.lower() in MISSING:
+        return False
+    has_letters = any(character.isalpha() for character in first)
+    return has_letters and not math.isfinite(file.to_number(first))
+
+
+def no_row(file: CsvLines, row: int) -> TableUnfit:
+    """Make the error for a line among the rows that is none."""
+    text = file.rows[row]
     sign = _first_sign(text)
     found = f"{text[:EXCERPT_CHARACTERS]!r}, a line that is no row of numbers"
     leave_out = ""
@@ -611,7 +632,7 @@ def _require_row(file: CsvLines, row: int) -> None:
     else:
         found = f"an empty line, {found}"
     parts = _keep_to(file, row) if row else "`keep`"
-    raise TableUnfit(
+    return TableUnfit(
         file.row_place(row),
         found=found,
         expected="rows of numbers alone, after the header",

@@ -14,7 +14,7 @@ import numpy as np
 from daq.config.import_description import Column, ImportDescription, TimeColumn, TimeUnit
 from daq.errors import TableUnfit
 from daq.files import sha256
-from daq.log.csv_lines import MISSING, CsvLines, read_lines
+from daq.log.csv_lines import MISSING, CsvLines, begins_with_word, no_row, read_lines
 from daq.log.table import (
     ABSOLUTE_S,
     MIDNIGHT,
@@ -38,6 +38,7 @@ DAY_NS = 86_400 * 10**9
 FEWEST_BACK = 3
 LARGEST_BACK_SHARE = 0.1  #: Likewise, as a share of the rows
 _ISO = re.compile(r"(\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d)(?:[.,](\d{1,9})\d*)?(Z|[+-]\d\d:?\d\d)")
+_LIKE_CLOCK = re.compile(r"\d{1,2}:[0-5]\d(?!\d)")  #: A time in whatever spelling
 _CLOCK = re.compile(r"(?:(\d{4}-\d\d-\d\d)[T ])?(\d{1,2}):([0-5]\d):([0-5]\d)(?:[.,](\d{1,9})\d*)?")
 
 
@@ -141,7 +142,7 @@ def _stamps(file: CsvLines, time: TimeColumn, values: FloatArray) -> tuple[Stamp
     seconds = values * time.unit.seconds
     _check_reach(file, time, seconds)
     if abs(seconds[0]) < ABSOLUTE_S:
-        time_s, remarks = without_wraps(seconds, counter_wraps())
+        time_s, remarks = without_wraps(seconds, (*counter_wraps(), MIDNIGHT))
         if remarks:
             return stamps_of_numbers(time_s, TimeUnit.SECOND), remarks
         return stamps_of_numbers(values, time.unit), ()
@@ -272,7 +273,11 @@ def _numbers(file: CsvLines, columns: Sequence[Column]) -> FloatArray:
     if wrong.size:
         number, column = wrong[0].tolist()
         index = indices[column]
-        text = file.fields(file.rows[number])[index]
+        fields = file.fields(file.rows[number])
+        text = fields[index]
+        is_header = fields == list(file.names)
+        if begins_with_word(file, number) and not is_header:
+            raise no_row(file, number)
         remedy = _remedy(file, number, text, values)
         raise TableUnfit(
             file.field_place(number, index),
@@ -370,6 +375,11 @@ def _remedy(file: CsvLines, row: int, text: str, values: FloatArray) -> str:
             "if this is the time, write `unit: clock` under `time` in the import description: a "
             "time of day, without a date and its zone, so that nothing is known of the order of "
             "runs; `unit: iso8601` reads both"
+        )
+    if _LIKE_CLOCK.search(text):
+        return (
+            "if this is the time, export it as 08:00:00.004, of 24 hours, or as 2026-03-01 "
+            "08:00:00.004, and write `unit: clock` under `time` in the import description"
         )
     return _remedy_for_a_line(file, row, text, values)
 

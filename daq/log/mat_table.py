@@ -26,6 +26,7 @@ from daq.config.import_description import Column, ImportDescription, TimeColumn,
 from daq.errors import TableUnfit, first_few
 from daq.files import read_regular
 from daq.log.table import (
+    MIDNIGHT,
     Stamps,
     Table,
     check_reach,
@@ -142,7 +143,7 @@ def _stamps(path: Path, values: NDArray[Any], time: TimeColumn) -> tuple[Stamps,
     factor = round(time.unit.seconds * 1e9)
     seconds = values.astype(np.float64) * time.unit.seconds
     check_reach(seconds, lambda row: f"{path}, row {row + 1}, column {time.column}")
-    whole_s, remarks = without_wraps(seconds, counter_wraps())
+    whole_s, remarks = without_wraps(seconds, (*counter_wraps(), MIDNIGHT))
     if remarks:
         stamps = stamps_of_numbers(whole_s, TimeUnit.SECOND)
         return stamps, tuple(f"{path.name}: {remark}" for remark in remarks)

@@ -309,6 +309,7 @@ def counter_wraps() -> tuple[Wrap, ...]:
     return tuple(found)
 
 
+#: A time of day of a controller (IEC 61131-3: ms since midnight) is a number that does so too
 MIDNIGHT = Wrap(86400.0, "times of day that pass midnight")
 
 

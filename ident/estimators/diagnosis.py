@@ -73,6 +73,13 @@ recordings.
 #: Of another estimator's gain from that of ml: relative, and in σ of ml
 GAIN_DIFFERENCE, GAIN_SIGMAS = 0.1, 3.0
 UNSEEN_SIGMAS = 2.0
+OR_POSITION = (
+    " If not, does the position of this axis, or its <axis> in the URDF? About a vertical axis the "
+    "torques do not tell the two apart"
+)
+"""Of a reversed gain of the first axis: the arm and its mirror image have the same torques but for
+the sign of this one.
+"""
 """A gain that is less than this many σ from zero is no result.
 
 One that is less than GAIN_SIGMAS from it is none either where its sign or its size is not that of a
@@ -267,7 +274,9 @@ def gain_diagnoses(
     is_absurd = has_other_sign | outside(ratio_size, 0.0, absurd_range)
     is_unseen = ~is_known & ~is_off & (is_absurd | may_be_zero)
     for axis in np.flatnonzero(is_known & has_other_sign).tolist():
-        yield _reversed_current(axes[axis], _gain_text(estimate, axis), nameplate[axis])
+        alternative = OR_POSITION if axis == 0 else ""
+        gain_text = _gain_text(estimate, axis)
+        yield _reversed_current(axes[axis], gain_text, nameplate[axis], alternative)
     for axis in np.flatnonzero(is_unseen).tolist():
         yield _unseen_gain(axes[axis], _gain_text(estimate, axis), nameplate[axis])
     for axis in np.flatnonzero(is_off).tolist():
@@ -282,10 +291,10 @@ def _gain_text(estimate: Estimate, axis: int) -> str:
     return f"a gain of {gain:.4g} ± {std:.2g}"
 
 
-def _reversed_current(axis: str, gain_text: str, nameplate: float) -> Diagnosis:
+def _reversed_current(axis: str, gain_text: str, nameplate: float, alternative: str) -> Diagnosis:
     """A gain whose sign is not that of the nameplate."""
     expected = f"the sign of the nameplate, {nameplate:.4g}"
-    advice = "does the drive, or the import, count this current the other way?"
+    advice = f"does the drive, or the import, count this current the other way?{alternative}"
     return Diagnosis("current-reversed", (), (axis,), gain_text, expected, advice)
 
 

@@ -5,8 +5,10 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from daq.config.cell import model_of
 from daq.config.cell_file import load_cell
 from daq.config.urdf_text import urdf_text
 from daq.environment import shipped_configurations
@@ -112,3 +114,16 @@ def test_a_file_with_a_name_in_it_is_no_urdf(text: bytes) -> None:
     """The reader of `ident` took it for its argument, and gave advice in Python."""
     with pytest.raises(ConfigurationInconsistent, match=r"one line of text.*not a file with its"):
         urdf_text(text, "arm.urdf")
+
+
+def test_a_byte_order_mark_and_an_entity_of_its_own_are_read(cell_path: Path) -> None:
+    urdf = cell_path.parents[1] / "robots/rx90.urdf"
+    expected = [joint.translation_m for joint in model_of(load_cell(cell_path)).robot.joints]
+    text = urdf.read_text(encoding="utf-8")
+    _, _, body = text.partition("<robot")
+    assert "0.45" in body
+    named = body.replace("0.45", "&reach;")
+    entity = '<!DOCTYPE robot [<!ENTITY reach "0.45">]>\n<robot'
+    urdf.write_text(entity + named, encoding="utf-8-sig")
+    actual = [joint.translation_m for joint in model_of(load_cell(cell_path)).robot.joints]
+    np.testing.assert_array_equal(actual, expected)

@@ -116,6 +116,17 @@ def test_a_bag_is_read_as_it_was_written(compression: CompressionType, tmp_path:
     assert_whole(read(path))
 
 
+def test_joints_in_another_order_in_each_message_are_the_same_samples(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    messages = []
+    for row in range(ROWS):
+        order = rng.permutation(6).tolist()
+        messages.append(("/joint_states", message(row, order)))
+    table = read(write_bag(tmp_path / "run.mcap", messages))
+    assert_whole(table)
+    assert table.remarks == ()
+
+
 def _repack(source: Path, target: Path, **options: Any) -> Path:
     """The messages of a bag, written once more by the general writer with its own options."""
     with source.open("rb") as read_from, target.open("wb") as stream:

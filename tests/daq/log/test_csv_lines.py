@@ -317,6 +317,13 @@ def test_a_name_with_the_sign_of_a_comment_is_still_a_name(tmp_path: Path) -> No
         ("// pause", 5),
         ("MARK end", COUNT),
         ("end of trace", COUNT),
+        ("MARK,3", 5),
+        ("MARK,3,", 5),
+        ("MARK,3,1", 5),
+        ("Samples,12", COUNT),
+        ("Samples,12,", COUNT),
+        ("Samples,12,4", COUNT),
+        ("Samples: 12,4", COUNT),
     ],
 )
 def test_a_line_among_the_rows_that_is_none_is_named(tmp_path: Path, line: str, place: int) -> None:
@@ -331,12 +338,14 @@ def test_a_line_among_the_rows_that_is_none_is_named(tmp_path: Path, line: str, 
     ) as caught:
         _read(tmp_path, lines)
     assert "delimiter" not in caught.value.remedy
+    assert "ends early" not in caught.value.remedy
     assert f"`keep: {{to_row: {place}}}`" in caught.value.remedy
     keep = KeptPart(to_row=place)
     before = _read(tmp_path, lines, keep=keep)
     np.testing.assert_array_equal(before.values, READ[:place])
     word, _, _ = line.partition(" ")
-    sign = word[:4] if word.isalpha() else word
+    sign = word[:4] if word[:1].isalpha() else word
+    assert f"`comment: {sign!r}`" in caught.value.remedy
     table = _read(tmp_path, lines, comment=sign)
     np.testing.assert_array_equal(table.values, READ)
     if place < COUNT:
@@ -388,10 +397,11 @@ def test_the_minus_sign_of_typography_is_read(tmp_path: Path) -> None:
     assert table.remarks == ("run.csv: the minus sign U+2212 was read as -",)
 
 
+@pytest.mark.parametrize("cut_off", ["0.12,0.3", "0.12,", "0.12,0.3,", "nan,0.3", "0.12,nan,"])
 def test_a_last_line_that_was_cut_off_is_left_out_by_the_setting_that_is_named(
-    tmp_path: Path,
+    tmp_path: Path, cut_off: str
 ) -> None:
-    lines = ["t,q,i", *ROWS, "0.12,0.3"]
+    lines = ["t,q,i", *ROWS, cut_off]
     pattern = rf"the file ends early.*`keep: \{{to_row: {COUNT}\}}`"
     with pytest.raises(TableUnfit, match=pattern):
         _read(tmp_path, lines, end="")

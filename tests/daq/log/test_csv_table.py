@@ -78,6 +78,16 @@ def test_encodings(tmp_path: Path, encoding: str, bom: bytes, remark: str) -> No
     assert [remark in text and text.startswith("run.csv: ") for text in table.remarks] == expected
 
 
+def test_a_european_export_is_read(tmp_path: Path) -> None:
+    """Semicolons, decimal commas, Windows-1252, CRLF and umlauts at once."""
+    rows = [row.replace(",", ";").replace(".", ",") for row in ROWS]
+    text = "\r\n".join(("Größe [°];Strom [µA]", *rows)) + "\r\n"
+    columns = ("Größe [°]", "Strom [µA]")
+    table = _read(tmp_path, text.encode("cp1252"), columns, delimiter=";", decimal=",")
+    np.testing.assert_array_equal(table.values, VALUES)
+    assert table.remarks == ("run.csv: no UTF-8; read as Windows-1252",)
+
+
 @pytest.mark.parametrize(
     ("data", "found"),
     [
@@ -367,6 +377,44 @@ def test_a_time_of_day_where_a_number_is_expected_names_the_unit(tmp_path: Path,
     stamps = [text] * 3
     with pytest.raises(TableUnfit, match=r"run\.csv:2, column t.*`unit: clock`.*`unit: iso8601`"):
         _stamped(tmp_path, TimeUnit.SECOND, stamps)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "08:59:00:000",
+        "08:59:00.000 AM",
+        "8:59 AM",
+        "08:59",
+        "01.03.2026 08:59:00",
+        "03/01/2026 08:59:00.000",
+    ],
+)
+def test_a_time_in_another_spelling_is_no_line_to_be_left_out(tmp_path: Path, text: str) -> None:
+    stamps = [text] * 3
+    with pytest.raises(TableUnfit, match=r"export it as 08:00:00\.004.*`unit: clock`") as caught:
+        _stamped(tmp_path, TimeUnit.SECOND, stamps)
+    assert "from_row" not in caught.value.remedy
+
+
+@pytest.mark.parametrize(
+    ("unit", "digits", "step"),
+    [(TimeUnit.MILLISECOND, 0, 4), (TimeUnit.SECOND, 3, 4), (TimeUnit.MICROSECOND, 0, 4000)],
+)
+def test_a_number_since_midnight_goes_on_over_midnight(
+    tmp_path: Path, unit: TimeUnit, digits: int, step: int
+) -> None:
+    """A time of day of a PLC (IEC 61131-3): so many ms since midnight."""
+    scale = 10**digits
+    day = round(86_400 * scale / unit.seconds)
+    counts = [(day - 3 * step + step * row) % day for row in range(8)]
+    assert min(np.diff(counts)) < 0
+    stamps = [f"{count / scale:.{digits}f}" for count in counts]
+    table = _stamped(tmp_path, unit, stamps)
+    assert table.stamps is not None
+    expected = step / scale * unit.seconds * np.arange(8.0)
+    assert table.stamps.time_s == pytest.approx(expected, abs=1e-9)
+    assert "times of day that pass midnight" in table.remarks[0]
 
 
 @pytest.mark.parametrize(

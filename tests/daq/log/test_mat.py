@@ -317,3 +317,15 @@ def test_a_counter_of_time_that_wraps_goes_on(kind: type, tmp_path: Path) -> Non
     expected = 0.01 * np.arange(6)
     assert table.stamps.time_s == pytest.approx(expected, abs=1e-9)
     assert "a counter of 32 bits in us that wraps" in table.remarks[0]
+
+
+def test_a_number_since_midnight_goes_on_over_midnight(tmp_path: Path) -> None:
+    path = tmp_path / "run.mat"
+    since_midnight_ms = (86_400_000 - 12 + 4 * np.arange(6)) % 86_400_000
+    savemat(path, {"t": since_midnight_ms.astype(np.uint32), "q": np.arange(6.0)})
+    column = TimeColumn(file="run.mat", column="t", unit=TimeUnit.MILLISECOND)
+    table = read_mat(path, ImportDescription.model_construct(), ("q",), column)
+    assert table.stamps is not None
+    expected = 0.004 * np.arange(6)
+    assert table.stamps.time_s == pytest.approx(expected, abs=1e-9)
+    assert "times of day that pass midnight" in table.remarks[0]

@@ -5,6 +5,7 @@ and the arm that is guessed without them.
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ import pytest
 from daq.config.cell import model_of
 from daq.config.cell_file import load_cell
 from daq.errors import ConfigurationInconsistent, SchemaMismatch
-from daq.workflow.experiment import guessed_capsules, scene_of
+from daq.workflow.experiment import LINK_RADIUS, guessed_capsules, scene_of
 from ident.planning.clearance import BASE
 
 CONFIGS = Path(__file__).parents[3] / "configs"
@@ -110,3 +111,29 @@ def test_links_that_change_their_length_are_not_guessed() -> None:
     for capsule in guessed_capsules(robot):
         assert capsule.link != BASE
         assert capsule.link > 2
+
+
+@pytest.mark.parametrize("gap_m", [0.005, 0.015])
+def test_links_of_a_guessed_arm_that_never_keep_the_distance_belong_together(
+    cell_file: Path, gap_m: float
+) -> None:
+    """A column, and an upper arm that turns about the end of a short link above it."""
+    cell = load_cell(cell_file)
+    robot = model_of(cell).robot
+    column, shoulder, *others = robot.joints
+    column_m = 0.4
+    # The guess takes a radius from the whole length of the arm, which the short link is part of.
+    reach_m = sum(float(np.linalg.norm(joint.translation_m)) for joint in others) + column_m
+    short_m = 0.0
+    for _ in range(30):
+        radius_m = LINK_RADIUS * (reach_m + short_m)
+        short_m = radius_m + gap_m
+    above = replace(column, translation_m=np.array([0.0, 0.0, column_m]))
+    beside = replace(shoulder, translation_m=np.array([0.0, 0.0, short_m]))
+    arm = replace(robot, joints=(above, beside, *others))
+    found = scene_of(cell, arm, 4.59)
+    assert (found.checker.scene.minimum_m, found.guessed) == (0.01, True)
+    is_together = ("base", "link 2") in found.together
+    assert is_together == (gap_m < 0.01)
+    remarks = "\n".join(found.remarks)
+    assert ("nearly every posture: base and link 2" in remarks) == is_together

@@ -171,6 +171,19 @@ def test_a_reversed_current_only_turns_a_free_gain(small_truth: Truth, clean: li
     runs = with_currents(clean, np.array([1.0, -1.0, 1.0]))
     (found,) = diagnosed(small_truth, runs)
     assert (found.name, found.axes) == ("current-reversed", ("J2",))
+    assert "position" not in found.remedy
+
+
+def test_a_reversed_position_of_a_vertical_axis_is_not_blamed_on_its_current_alone(
+    small_truth: Truth, clean: list[Run]
+) -> None:
+    """The mirror image of the arm has the same torques, but for the sign of this one."""
+    signs = np.array([-1.0, 1.0, 1.0])
+    mirrored = [replace(run, position_rad=run.position_rad * signs) for run in clean]
+    for runs in (mirrored, with_currents(clean, signs)):
+        (found,) = diagnosed(small_truth, runs)
+        assert (found.name, found.axes) == ("current-reversed", ("J1",))
+        assert "this current the other way? If not, does the position" in found.remedy
 
 
 @pytest.mark.parametrize(
