@@ -214,11 +214,13 @@ def fit_verb(request: FitRequest) -> None:
         require_packages(
             "full parameters", "the semidefinite solver", "physical", "cvxpy", "clarabel"
         )
+    prior = _read_prior(request)
     with status("identifying"):
         found = _fit(request)
         calibration = calibration_of_case(found, datetime.now(UTC))
         if request.wants_full:
-            calibration = replace(calibration, full_parameters=_full_set(request, found.fitted))
+            full_parameters = _full_set(request, found.fitted, prior)
+            calibration = replace(calibration, full_parameters=full_parameters)
     refused = geometry_refusal(calibration.diagnoses)
     if refused is not None:  # nothing is written, and no gains are shown that mean nothing
         if request.json:
@@ -273,17 +275,26 @@ def _fit(request: FitRequest) -> CaseFit:
     return replace(essential_fit(found.fitted, request.essential), payloads=found.payloads)
 
 
-def _full_set(request: FitRequest, fitted: Fit) -> FullSet:
-    """Find all standard parameters under the prior that is asked for."""
+def _read_prior(request: FitRequest) -> str | None:
+    """Read the URDF of --prior: before the fit, which would be lost where it cannot be read."""
 
     from daq.config.urdf_text import urdf_text
     from daq.config.yaml_file import read_yaml_bytes
+
+    if request.prior is None:
+        return None
+    return urdf_text(read_yaml_bytes(request.prior), str(request.prior))
+
+
+def _full_set(request: FitRequest, fitted: Fit, prior: str | None) -> FullSet:
+    """Find all standard parameters under the prior that is asked for."""
+
     from daq.workflow.full_parameters import DEFAULT_TOLERANCE, OF_CELL, full_set
 
     urdf = fitted.cell.urdf
     name = OF_CELL
-    if request.prior is not None:
-        urdf = urdf_text(read_yaml_bytes(request.prior), str(request.prior))
+    if request.prior is not None and prior is not None:
+        urdf = prior
         name = request.prior.name
     return full_set(fitted, urdf, name, request.prior_tolerance or DEFAULT_TOLERANCE)
 

@@ -301,6 +301,7 @@ def dcf_document(content: bytes, name: str) -> DcfDocument:
 
 _LINE = re.compile(r"([^\r\n]*)(?:\r\n|\r|\n|\Z)")
 _SECTION = re.compile(r"\s*\[([^\]]*)\]\s*")
+LONGEST_NAME = 1000  #: Characters of a name
 _BYTE_ORDER_MARK = "ï»¿"  #: That of UTF-8, each byte a character
 
 
@@ -372,12 +373,29 @@ def _lines_text(sections: list[DcfSection]) -> str:
     return " and ".join(str(section.line) for section in sections)
 
 
+def _require_short_names(file: str, text: str) -> None:
+    """Refuse a name that configparser would look through for minutes.
+
+    Its time grows with the square of the blanks in a name; CiA 306 has lines of 255 characters.
+    """
+    for number, line in enumerate(_LINE.finditer(text), start=1):
+        name = line[1].partition("=")[0].strip()
+        if len(name) > LONGEST_NAME and not name.startswith(";"):
+            raise ControllerUnfit(
+                f"{file}:{number}",
+                found=f"{len(name)} characters before the first `=` or the end of the line",
+                expected=f"at most {LONGEST_NAME} (CiA 306: 255 in a line)",
+                remedy="correct the line; nothing was written",
+            )
+
+
 def parsed_values(file: str, text: str) -> dict[KeyPath, str]:
     """Return the values by section and name, as configparser reads them.
 
     Raises:
-        ControllerUnfit: it cannot read them.
+        ControllerUnfit: it cannot read them, or a name is too long.
     """
+    _require_short_names(file, text)
     parser = configparser.RawConfigParser(
         strict=False,
         allow_no_value=True,

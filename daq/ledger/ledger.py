@@ -648,6 +648,10 @@ def _check_like(ledger: Ledger, calibration: Calibration, history: History) -> N
     elif history.other_robots:
         found = str(history.other_robots[0])
         expected = "calibrations of one robot in a history"
+    elif not known and units.keys() != set(ledger.cell.axis_names):
+        found = f"gains of {', '.join(units)}"
+        expected = f"of {', '.join(ledger.cell.axis_names)}, the axes of the cell file"
+        remedy = "give the cell file of the robot that was calibrated; it was not entered"
     elif known and units.keys() != known.keys():
         found = f"gains of {', '.join(units)}"
         expected = f"of {', '.join(known)}"

@@ -54,7 +54,11 @@ def generate(folder: Path, name: str, password: str = "") -> tuple[Path, PublicK
     try:
         folder.mkdir(parents=True, exist_ok=True)
         _write_new(secret, key.text(password, os.urandom(32)), 0o600)
-        _write_new(public, key.public.text, 0o644)
+        try:
+            _write_new(public, key.public.text, 0o644)
+        except BaseException:
+            secret.unlink(missing_ok=True)
+            raise
     except OSError as error:
         raise OutputFailed.of(Path(error.filename or folder), error) from error
     return secret, key.public
@@ -223,8 +227,13 @@ def _write_new(path: Path, text: str, mode: int) -> None:
     # O_EXCL: a key that is made at the same time stays. The mode is set before a byte of the secret
     # is written.
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, mode)
-    with os.fdopen(descriptor, "wb") as stream:
-        os.fchmod(descriptor, mode)
-        stream.write(text.encode())
-        stream.flush()
-        os.fsync(descriptor)
+    try:
+        with os.fdopen(descriptor, "wb") as stream:
+            os.fchmod(descriptor, mode)
+            stream.write(text.encode())
+            stream.flush()
+            os.fsync(descriptor)
+    except BaseException:
+        # Half a key is of no use, and would keep the next try from its name.
+        path.unlink(missing_ok=True)
+        raise

@@ -44,6 +44,10 @@ XACRO_SPACES = (
 XACRO_EXPRESSION = "${"
 UNBOUND_PREFIX = "unbound prefix"  #: Of the parser's message
 LARGEST_DISTANCE_M = 50.0  #: Between joints that follow each other: more than any gantry has
+#: Of a link: beyond these a number is noise of an export, whatever its unit, and products overflow
+LEAST_MASS = 1e-9
+LARGEST_MASS = 1e9
+LARGEST_INERTIA = 1e15
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -406,8 +410,8 @@ def read_urdf(urdf: str) -> UrdfRobot:
     """Read joints, bodies and effort limits of a URDF.
 
     A link without a readable mass or centre of mass counts as massless, one without a readable
-    inertia as a point mass: they only guide the choice of moves, and a URDF for identification need
-    not have them.
+    inertia as a point mass, and a number that no link has is none: they only guide the choice of
+    moves, and a URDF for identification need not have them.
 
     Raises:
         ModelError: the text is no URDF, has no moving joint, or a joint of more than one degree of
@@ -657,9 +661,15 @@ def _body(link: Element) -> Body:
         rotation, centre = _origin(inertial, name)
     except ModelError:
         return nothing
+    is_noise = mass != 0.0 and not LEAST_MASS <= abs(mass) <= LARGEST_MASS
+    distance = float(np.max(np.abs(centre)))
+    if is_noise or distance > LARGEST_DISTANCE_M:
+        return nothing
     try:
         tensor = _inertia_tensor(_part(inertial, "inertia", name), name)
     except ModelError:
+        return Body(mass, centre, np.zeros((3, 3)))
+    if np.max(np.abs(tensor)) > LARGEST_INERTIA:
         return Body(mass, centre, np.zeros((3, 3)))
     return Body(mass, centre, rotation @ tensor @ rotation.T)
 

@@ -972,3 +972,19 @@ def test_a_long_line_of_blanks_in_a_dcf_does_not_hold_up_its_reader() -> None:
     [scalar] = decode_document(text.encode(), "a.dcf").locate(("2003",))
     assert scalar.value == 12.5
     assert text[scalar.start : scalar.end] == "12.5"
+
+
+@pytest.mark.parametrize("line", ["a{}b=1", "a{}b"])
+def test_blanks_in_a_name_of_a_dcf_do_not_hold_up_its_second_reader(line: str) -> None:
+    """The time of configparser grows with their square: 200 000 would take an hour."""
+    text = "[2003]\nDataType=0x0008\nParameterValue=12.5\n" + line.format(" " * 200_000) + "\n"
+    document = decode_document(text.encode(), "a.dcf")
+    with pytest.raises(ControllerUnfit, match=r"a\.dcf:4.*200002 characters"):
+        document.readings()
+
+
+def test_a_long_comment_and_a_long_value_of_a_dcf_are_read() -> None:
+    long = "x " * 5_000
+    text = f"[2003]\nDataType=0x0008\nParameterValue=12.5\nDenotation={long}\n; {long}\n"
+    first, second = decode_document(text.encode(), "a.dcf").readings()
+    assert first["2003", "denotation"] == second["2003", "denotation"] == long.strip()

@@ -147,6 +147,17 @@ def test_what_cannot_be_compared_is_refused(ledger: Ledger, different: str) -> N
     assert "it was not entered" in refused.value.remedy
 
 
+def test_the_first_calibration_has_the_axes_of_the_cell(ledger: Ledger) -> None:
+    """Those of a history never change: with others, every right calibration would be refused."""
+    known = calibration_of(0)
+    renamed = replace(known.gains[0], axis="A1")
+    with pytest.raises(DataError) as refused:
+        enter(ledger, replace(known, gains=(renamed, *known.gains[1:])))
+    assert "the axes of the cell file" in refused.value.expected
+    assert read_history(ledger).entries == ()
+    enter(ledger, known)
+
+
 def test_what_is_applied_and_rolled_back_is_reported(ledger: Ledger) -> None:
     first = enter(ledger, calibration_of(0))
     second = enter(ledger, calibration_of(1))

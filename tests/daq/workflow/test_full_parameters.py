@@ -136,6 +136,18 @@ def test_options_that_leave_parameters_out_are_refused_before_any_work(
     assert "pip install 'drivegain[physical]'" in capsys.readouterr().err
 
 
+def test_a_prior_that_cannot_be_read_is_refused_before_the_fit(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = tmp_path / "none.mcap"
+    prior = tmp_path / "none.urdf"
+    assert _fit(log, "--prior", prior) == ExitCode.CONFIGURATION
+    assert "none.urdf" in capsys.readouterr().err
+    prior.write_bytes(b"\x1f\x8b")
+    assert _fit(log, "--prior", prior) == ExitCode.CONFIGURATION
+    assert "none.urdf" in capsys.readouterr().err
+
+
 def test_the_full_set_comes_back_from_the_file_and_older_files_have_none() -> None:
     full_parameter = FullParameter("m2", 3.4, 0.3, "kg", "prior", 0.8, 3.5, 0.35)
     parameters = (

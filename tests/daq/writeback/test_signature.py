@@ -5,6 +5,7 @@ and whatever is changed is noticed.
 from __future__ import annotations
 
 import base64
+import errno
 import io
 import json
 import os
@@ -275,6 +276,26 @@ def test_a_secret_key_is_its_owners_alone_and_never_replaced(tmp_path: Path) -> 
     assert public.line in text
     secret_key = minisign.parse_secret_key(before.decode())
     assert "seed" not in repr(secret_key)
+
+
+@pytest.mark.parametrize("full_at", [1, 2])
+def test_a_full_disk_leaves_no_half_key(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, full_at: int
+) -> None:
+    synced: list[int] = []
+
+    def fill(descriptor: int) -> None:
+        synced.append(descriptor)
+        if len(synced) == full_at:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as disk:
+        disk.setattr(os, "fsync", fill)
+        with pytest.raises(OutputFailed):
+            generate(tmp_path, "anna")
+    assert list(tmp_path.iterdir()) == []
+    secret, _ = generate(tmp_path, "anna")
+    assert needs_password(secret) is False
 
 
 @pytest.mark.slow

@@ -302,6 +302,25 @@ def test_the_prior_is_the_urdf_or_a_ball() -> None:
     assert broken.links[0, 6:] == pytest.approx(prior.links[0, 6:])
 
 
+@pytest.mark.parametrize(
+    ("written", "absurd"),
+    [
+        ('mass value="10.0"', 'mass value="1e308"'),
+        ('mass value="10.0"', 'mass value="1e20"'),
+        ('mass value="10.0"', 'mass value="-1e20"'),
+        ('mass value="10.0"', 'mass value="1e-320"'),
+        ('ixx="0.05"', 'ixx="1e308"'),
+        ('xyz="0 0.02 -0.04"', 'xyz="0 1e200 -0.04"'),
+    ],
+)
+def test_a_number_that_no_link_has_counts_as_none(written: str, absurd: str) -> None:
+    urdf = TX40.urdf.replace(written, absurd, 1)
+    assert urdf != TX40.urdf
+    prior = inertia_prior(urdf)
+    assert prior.assumed == (0,)
+    assert np.all(np.isfinite(prior.factors))
+
+
 @pytest.mark.parametrize("arm", ARMS, ids=[arm.name for arm in ARMS])
 def test_the_grouping_comes_back_from_the_names(arm: Arm) -> None:
     model = _model(arm)
