@@ -436,7 +436,7 @@ def read_model(document: Document, model: type[Model], folder: Path | None = Non
                 document.name,
                 found=kind.value,
                 expected=model.document_kind.value,
-                remedy=f"{IN_ORDER} (CELL comes first){page}",
+                remedy=f"{_right_order(model)}{page}",
             ) from error
         required = [name for name, field in model.model_fields.items() if field.is_required()]
         keys = list(document.tree) if isinstance(document.tree, dict) else required
@@ -447,7 +447,7 @@ def read_model(document: Document, model: type[Model], folder: Path | None = Non
                 document.name,
                 found=f"a file of another kind, with {listed}",
                 expected=f"a file with {expected}",
-                remedy=f"{IN_ORDER} (CELL comes first){page}",
+                remedy=f"{_right_order(model)}{page}",
             ) from error
         items = error.errors(include_url=False)
         found_faults = [_fault(item, model, document.tree) for item in items[:MAX_EXPLAINED]]
@@ -461,6 +461,13 @@ def read_model(document: Document, model: type[Model], folder: Path | None = Non
             remedy += f" ({len(items) - MAX_EXPLAINED} more faults are not listed)"
         inner = [fault for fault in faults if fault.path not in outer]
         raise SchemaMismatch(**fault_texts(document, inner), remedy=remedy) from error
+
+
+def _right_order(model: type[StrictModel]) -> str:
+    """What to do about a file of another kind: `simulate` alone takes no CELL."""
+    if model.document_kind in {DocumentKind.SIMULATION, DocumentKind.SCENARIO}:
+        return IN_ORDER
+    return f"{IN_ORDER} (CELL comes first)"
 
 
 def fault_texts(document: Document, faults: list[Fault]) -> dict[str, str]:

@@ -29,6 +29,15 @@ def test_the_truth_is_read(checkout: Path) -> None:
     assert load_simulation(path).payload is None
 
 
+def test_a_cell_file_for_a_simulation_is_refused_without_advice_on_a_cell(checkout: Path) -> None:
+    """`simulate` takes no CELL: none can come first."""
+    with pytest.raises(SchemaMismatch) as refused:
+        load_simulation(checkout / "configs/cells/demo.yaml")
+    assert refused.value.found == "a cell file"
+    assert refused.value.expected == "a simulation file"
+    assert "CELL" not in refused.value.remedy
+
+
 def test_an_unknown_payload_is_refused(checkout: Path) -> None:
     with pytest.raises(UsageError, match="disc, plate"):
         load_simulation(checkout / "configs/simulation/clean.yaml", "brick")
