@@ -275,27 +275,27 @@ def _fit(request: FitRequest) -> CaseFit:
     return replace(essential_fit(found.fitted, request.essential), payloads=found.payloads)
 
 
-def _read_prior(request: FitRequest) -> str | None:
-    """Read the URDF of --prior: before the fit, which would be lost where it cannot be read."""
+def _read_prior(request: FitRequest) -> tuple[str, str] | None:
+    """Name and text of the URDF of --prior; None without the option.
+
+    It is read before the fit, which would be lost where it cannot be read.
+    """
 
     from daq.config.urdf_text import urdf_text
     from daq.config.yaml_file import read_yaml_bytes
 
     if request.prior is None:
         return None
-    return urdf_text(read_yaml_bytes(request.prior), str(request.prior))
+    text = urdf_text(read_yaml_bytes(request.prior), str(request.prior))
+    return request.prior.name, text
 
 
-def _full_set(request: FitRequest, fitted: Fit, prior: str | None) -> FullSet:
-    """Find all standard parameters under the prior that is asked for."""
+def _full_set(request: FitRequest, fitted: Fit, prior: tuple[str, str] | None) -> FullSet:
+    """Find all standard parameters under a prior, name and URDF; None for that of the cell."""
 
     from daq.workflow.full_parameters import DEFAULT_TOLERANCE, OF_CELL, full_set
 
-    urdf = fitted.cell.urdf
-    name = OF_CELL
-    if request.prior is not None and prior is not None:
-        urdf = prior
-        name = request.prior.name
+    name, urdf = prior or (OF_CELL, fitted.cell.urdf)
     return full_set(fitted, urdf, name, request.prior_tolerance or DEFAULT_TOLERANCE)
 
 

@@ -122,9 +122,7 @@ def checked_geometry(
 
 
 def geometry_before_search(fitted: Fit, diagnoses: Sequence[Diagnosis]) -> Iterator[str]:
-    """Say the same of a search: its turns change neither the gravity of the fit that they begin
-    with nor the zeros that it does not show.
-    """
+    """Say the notes of `geometry_notes` of the fit that a search began with."""
     yield from geometry_notes(
         fitted.description,
         fitted.cell.axis_names,

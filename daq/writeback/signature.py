@@ -57,6 +57,7 @@ def generate(folder: Path, name: str, password: str = "") -> tuple[Path, PublicK
         try:
             _write_new(public, key.public.text, 0o644)
         except BaseException:
+            # Ctrl-C too: a secret key alone would keep the next try from its name.
             secret.unlink(missing_ok=True)
             raise
     except OSError as error:

@@ -274,8 +274,13 @@ def _parameter_count(effect: Effect) -> int:
 
 
 def is_better(one: FloatArray, other: FloatArray) -> BoolArray:
-    """Whether one ‖e‖² is less than the other by a paired comparison over folds, shape (…, folds):
-    (…,).
+    """Whether one ‖e‖² is less than the other by a paired comparison over folds.
+
+    Args:
+        one, other: ‖e‖² of each fold, shape (…, folds).
+
+    Returns:
+        shape (…,).
     """
     gain = other - one
     freedom = gain.shape[-1] - 1

@@ -73,17 +73,17 @@ recordings.
 #: Of another estimator's gain from that of ml: relative, and in σ of ml
 GAIN_DIFFERENCE, GAIN_SIGMAS = 0.1, 3.0
 UNSEEN_SIGMAS = 2.0
-OR_POSITION = (
-    " If not, does the position of this axis, or its <axis> in the URDF? About a vertical axis the "
-    "torques do not tell the two apart"
-)
-"""Of a reversed gain of the first axis: the arm and its mirror image have the same torques but for
-the sign of this one.
-"""
 """A gain that is less than this many σ from zero is no result.
 
 One that is less than GAIN_SIGMAS from it is none either where its sign or its size is not that of a
 drive.
+"""
+OR_POSITION = (
+    " If not, does the position of this axis, or its <axis> in the URDF? About a vertical axis the "
+    "torques do not tell the two apart"
+)
+"""Added to the advice on a reversed gain of the first axis: the mirror image of an arm has the same
+torques, except that of this axis, which has the other sign.
 """
 #: Of a gain to its nameplate, or the inverse, that no tolerance of a drive explains
 ABSURD_RATIO = 3.0
