@@ -274,7 +274,9 @@ def gain_diagnoses(
     is_absurd = has_other_sign | outside(ratio_size, 0.0, absurd_range)
     is_unseen = ~is_known & ~is_off & (is_absurd | may_be_zero)
     for axis in np.flatnonzero(is_known & has_other_sign).tolist():
-        alternative = OR_POSITION if axis == 0 else ""
+        alternative = ""
+        if axis == 0:
+            alternative = OR_POSITION
         gain_text = _gain_text(estimate, axis)
         yield _reversed_current(axes[axis], gain_text, nameplate[axis], alternative)
     for axis in np.flatnonzero(is_unseen).tolist():
