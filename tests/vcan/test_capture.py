@@ -217,7 +217,7 @@ def test_a_recording_that_follows_the_kernels_sync_loses_nothing(
     how = ("--duration", "10", "--exchanges", "1", "--seed", "3", "--condition", "1e9")
     say("plan", str(cell), "--out", str(plan), *how)
     with simulated(simulation):
-        for attempt in range(1, ATTEMPTS + 1):
+        for attempt in ATTEMPTS:
             log = tmp_path / f"{attempt}.mcap"
             reported = record_once(cell, plan, log)
             if reported["valid"]:

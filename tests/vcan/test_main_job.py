@@ -87,7 +87,7 @@ def job(tmp_path_factory: pytest.TempPathFactory, figure: Callable[[str], None])
                 mounted = []
             else:
                 mounted = ["--payload", payload, "--mass", mass]
-            for attempt in range(1, ATTEMPTS + 1):
+            for attempt in ATTEMPTS:
                 log = folder / f"{name}-{attempt}.mcap"
                 begun = time.monotonic()
                 one = record_once(cell, plan, log, *mounted)

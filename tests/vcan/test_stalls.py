@@ -190,9 +190,10 @@ def recording(folder: Path, faults: str = "") -> Iterator[Recording]:
             command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
         )
         try:
-            assert heard.moves.wait(PATIENCE_S), (
-                process.communicate()[1] if process.poll() is not None else "no motion"
-            )
+            give_up_s = time.monotonic() + PATIENCE_S
+            while not heard.moves.wait(0.1):
+                assert process.poll() is None, process.communicate()[1]
+                assert time.monotonic() < give_up_s, "no motion"
             time.sleep(0.5)
             yield Recording(process, heard)
         finally:
@@ -228,7 +229,7 @@ def test_a_short_stop_loses_nothing(
     tmp_path: Path, whole: bool, figure: Callable[[str], None]
 ) -> None:
     name = "recorder" if whole else "capture process"
-    for attempt in range(1, ATTEMPTS + 1):  # on a busy host the simulated amplifiers may be late
+    for attempt in ATTEMPTS:  # on a busy host the simulated amplifiers may be late
         folder = tmp_path / str(attempt)
         folder.mkdir()
         with recording(folder) as run:
@@ -241,8 +242,10 @@ def test_a_short_stop_loses_nothing(
                     os.kill(pid, signal.SIGCONT)
                 time.sleep(1.0)
             said, _ = run.end()
-            assert run.process.returncode in (ExitCode.OK, ExitCode.DATA_UNFIT), said
-            found = read_log(folder / "run.mcap")
+        # A busy host may starve the amplifiers: supervision ends such a run.
+        ended = (ExitCode.OK, ExitCode.DATA_UNFIT, ExitCode.DEVICE_FAULT)
+        assert run.process.returncode in ended, said
+        found = read_log(folder / "run.mcap")
         if found.statistics.valid:
             break
     lost = found.statistics.reason or "nothing lost"
@@ -275,7 +278,7 @@ def flooded(identifier: str = "7F0", rate_hz: int = FLOOD_HZ) -> Iterator[None]:
 def test_ctrl_c_stops_the_axes_on_a_flooded_bus(
     tmp_path: Path, identifier: str, rate_hz: int, figure: Callable[[str], None]
 ) -> None:
-    for attempt in range(1, ATTEMPTS + 1):
+    for attempt in ATTEMPTS:
         folder = tmp_path / str(attempt)
         folder.mkdir()
         with recording(folder) as run, flooded(identifier, rate_hz):
@@ -316,22 +319,30 @@ def test_a_fault_stops_the_axes_on_a_flooded_bus(
     tmp_path: Path, figure: Callable[[str], None]
 ) -> None:
     fault = f"  - {{fault: emergency, axis: J3, at_cycle: {STRIKE}, emcy_code: 0x2310}}\n"
-    with recording(tmp_path, fault) as run, flooded():
-        said, _ = run.end()
-        emcy_ns = min(at_ns for at_ns, number, _ in run.heard.frames if number == EMCY + 3)
-        stop_s = run.heard.stop_s(emcy_ns)
-        figure(
-            f"flood of {FLOOD_HZ} frames/s: stop {1e3 * stop_s:.0f} ms after the EMCY of an axis"
-        )
-        assert run.process.returncode == ExitCode.DEVICE_FAULT, said
-        assert "emergency stop" not in said
-        assert stop_s < max(2 * CYCLE_S, 0.05)
+    for attempt in ATTEMPTS:
+        folder = tmp_path / str(attempt)
+        folder.mkdir()
+        with recording(folder, fault) as run, flooded():
+            said, _ = run.end()
+            emcy_ns = [at_ns for at_ns, number, _ in run.heard.frames if number == EMCY + 3]
+        # A busy host may starve all amplifiers before J3 sends its EMCY.
+        if emcy_ns:
+            break
+    assert emcy_ns, said
+    stop_s = run.heard.stop_s(emcy_ns[0])
+    figure(
+        f"flood of {FLOOD_HZ} frames/s: stop {1e3 * stop_s:.0f} ms after the EMCY of an axis, "
+        f"attempt {attempt}"
+    )
+    assert run.process.returncode == ExitCode.DEVICE_FAULT, said
+    assert "emergency stop" not in said
+    assert stop_s < max(2 * CYCLE_S, 0.05)
 
 
 def test_a_deaf_node_on_a_flooded_bus_is_named_within_the_time_limit(
     tmp_path: Path, figure: Callable[[str], None]
 ) -> None:
-    for attempt in range(1, ATTEMPTS + 1):
+    for attempt in ATTEMPTS:
         folder = tmp_path / str(attempt)
         folder.mkdir()
         with (
@@ -339,12 +350,14 @@ def test_a_deaf_node_on_a_flooded_bus_is_named_within_the_time_limit(
             flooded(),
         ):
             said, _ = run.end()
-            answered_ns = max(at_ns for at_ns, number, _ in run.heard.frames if number == TPDO1 + 3)
-            stop_s = run.heard.stop_s(answered_ns)
-            closing_s = (time.time_ns() - answered_ns) * 1e-9
+            ended_ns = time.time_ns()
+            answers_ns = [at_ns for at_ns, number, _ in run.heard.frames if number == TPDO1 + 3]
         # A flooded guest on a busy host may starve the other amplifiers, too, before J3 is deaf.
-        if not re.search("no (axis answered|answer from J1)", said):
+        if answers_ns and not re.search("no (axis answered|answer from J1)", said):
             break
+    assert answers_ns, said
+    stop_s = run.heard.stop_s(answers_ns[-1])
+    closing_s = (ended_ns - answers_ns[-1]) * 1e-9
     stop_ms = 1e3 * stop_s
     figure(
         f"flood, J3 deaf: stop {stop_ms:.0f} ms after its last answer, end {closing_s:.1f} s, "

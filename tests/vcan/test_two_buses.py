@@ -92,7 +92,7 @@ def test_a_run_is_complete_and_its_syncs_are_near_together(
     how = ("--seed", "3", "--condition", "1e9", "--duration", "8", "--exchanges", "20")
     say("plan", str(cell), "--out", str(plan), *how)
     with SyncTimes(INTERFACE) as left, SyncTimes(SECOND_INTERFACE) as right:
-        for attempt in range(1, ATTEMPTS + 1):
+        for attempt in ATTEMPTS:
             log = tmp_path / f"{attempt}.mcap"
             done = record_once(cell, plan, log)
             syncs = left.taken(), right.taken()
