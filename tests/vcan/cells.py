@@ -22,10 +22,6 @@ from tests.vcan.run import INTERFACE
 
 CONFIGURATIONS = Path(__file__).parents[2] / "configs"
 SIMULATION = "clean"
-ATTEMPTS = range(1, 9)
-"""A guest on a busy host stands still for a moment: SYNC is late, or the amplifiers miss the
-recorder, and the run is ended or marked invalid as at a real cell. One records again.
-"""
 MAX_SUBSTEPS = 100
 POSITION_CUTOFF = 0.2
 DECIMATION_CUTOFF = 0.1

@@ -24,7 +24,12 @@ SECOND_BUS_NS = 10_000_000
 cycles last 40 ms there.
 """
 WITHOUT_CAN = ("test_run.py", "test_judgement.py", "test_punctuality.py")
+ATTEMPTS = 8
+"""A guest on a busy host stands still for a moment: SYNC is late, or the amplifiers miss the
+recorder, and the run is ended or marked invalid as at a real cell. One records again.
+"""
 FIGURES = pytest.StashKey[list[str]]()
+EXCUSED = pytest.StashKey[bool]()
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -33,6 +38,7 @@ def pytest_configure(config: pytest.Config) -> None:
         "markers", f"vcan: needs the kernel's CAN as {INTERFACE} (make test-vcan)"
     )
     config.stash[FIGURES] = []
+    config.stash[EXCUSED] = False
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -68,6 +74,7 @@ def pytest_runtest_makereport(
     path, line, _ = item.location
     reason = f"it failed, and this machine is too slow for it now: {measured}"
     item.config.stash[FIGURES].append(f"{item.nodeid}: {reason}; {report.longreprtext[-300:]}")
+    item.config.stash[EXCUSED] = True
     report.outcome = "skipped"
     report.longrepr = (path, (line or 0) + 1, reason)
     return report
@@ -87,6 +94,14 @@ def pytest_terminal_summary(
 def figure(pytestconfig: pytest.Config) -> Iterator[Callable[[str], None]]:
     """Takes a line for the end of the session's report."""
     yield pytestconfig.stash[FIGURES].append
+
+
+@pytest.fixture(scope="module")
+def attempts(pytestconfig: pytest.Config) -> range:
+    """Numbers of the attempts at a recording; one alone where the machine has been too slow."""
+    if pytestconfig.stash[EXCUSED]:
+        return range(1, 2)
+    return range(1, ATTEMPTS + 1)
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -23,7 +23,7 @@ from drivers.canopen.link import Link
 from drivers.canopen.sdo import SdoPolicy
 from drivers.canopen.socketcan import CapturedMessage, SocketcanBus, open_socketcan
 from drivers.errors import BusError
-from tests.vcan.cells import ATTEMPTS, record_once, say, simulated, write_cell, write_simulation
+from tests.vcan.cells import record_once, say, simulated, write_cell, write_simulation
 from tests.vcan.run import INTERFACE
 
 FRAME = struct.Struct("=IB3x8s")
@@ -205,7 +205,7 @@ def test_bus_off_is_reported(wire: socket.socket) -> None:
 
 
 def test_a_recording_that_follows_the_kernels_sync_loses_nothing(
-    tmp_path: Path, figure: Callable[[str], None]
+    tmp_path: Path, attempts: range, figure: Callable[[str], None]
 ) -> None:
     cell = write_cell(tmp_path, PERIOD_US, "timed")
     simulation = write_simulation(tmp_path, PERIOD_US)
@@ -217,7 +217,7 @@ def test_a_recording_that_follows_the_kernels_sync_loses_nothing(
     how = ("--duration", "10", "--exchanges", "1", "--seed", "3", "--condition", "1e9")
     say("plan", str(cell), "--out", str(plan), *how)
     with simulated(simulation):
-        for attempt in ATTEMPTS:
+        for attempt in attempts:
             log = tmp_path / f"{attempt}.mcap"
             reported = record_once(cell, plan, log)
             if reported["valid"]:

@@ -18,7 +18,7 @@ from daq.config.cell_file import load_cell
 from daq.errors import ClockImplausible
 from daq.log.conversion import load_run
 from daq.simulation.simulation_file import load_simulation
-from tests.vcan.cells import ATTEMPTS, record_once, say, simulated, write_cell, write_simulation
+from tests.vcan.cells import record_once, say, simulated, write_cell, write_simulation
 
 PERIOD_US = 20_000
 SECONDS = 12
@@ -56,7 +56,9 @@ def _in_time(log: Path) -> bool:
 
 
 @pytest.fixture(scope="module")
-def job(tmp_path_factory: pytest.TempPathFactory, figure: Callable[[str], None]) -> Job:
+def job(
+    tmp_path_factory: pytest.TempPathFactory, attempts: range, figure: Callable[[str], None]
+) -> Job:
     """The job up to the calibration."""
     folder = tmp_path_factory.mktemp("job")
     cell = write_cell(folder, PERIOD_US, "timed")
@@ -87,7 +89,7 @@ def job(tmp_path_factory: pytest.TempPathFactory, figure: Callable[[str], None])
                 mounted = []
             else:
                 mounted = ["--payload", payload, "--mass", mass]
-            for attempt in ATTEMPTS:
+            for attempt in attempts:
                 log = folder / f"{name}-{attempt}.mcap"
                 begun = time.monotonic()
                 one = record_once(cell, plan, log, *mounted)

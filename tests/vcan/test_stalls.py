@@ -26,7 +26,7 @@ from daq.errors import ExitCode
 from daq.log.reader import read_log
 from drivers.profiles.cia402 import State
 from tests.faults.test_scenario import PLAN
-from tests.vcan.cells import ATTEMPTS, simulated, write_cell, write_simulation
+from tests.vcan.cells import simulated, write_cell, write_simulation
 from tests.vcan.run import INTERFACE
 from tests.vcan.test_bus_faults import NODES, at_rest, raw, states_after
 
@@ -226,10 +226,10 @@ def test_sync_and_heartbeat_end_when_the_recorder_hangs(
 
 @pytest.mark.parametrize("whole", [True, False], ids=["recorder", "capture process"])
 def test_a_short_stop_loses_nothing(
-    tmp_path: Path, whole: bool, figure: Callable[[str], None]
+    tmp_path: Path, attempts: range, whole: bool, figure: Callable[[str], None]
 ) -> None:
     name = "recorder" if whole else "capture process"
-    for attempt in ATTEMPTS:  # on a busy host the simulated amplifiers may be late
+    for attempt in attempts:  # on a busy host the simulated amplifiers may be late
         folder = tmp_path / str(attempt)
         folder.mkdir()
         with recording(folder) as run:
@@ -276,9 +276,9 @@ def flooded(identifier: str = "7F0", rate_hz: int = FLOOD_HZ) -> Iterator[None]:
     ids=["unused identifier", "surplus PDOs"],
 )
 def test_ctrl_c_stops_the_axes_on_a_flooded_bus(
-    tmp_path: Path, identifier: str, rate_hz: int, figure: Callable[[str], None]
+    tmp_path: Path, attempts: range, identifier: str, rate_hz: int, figure: Callable[[str], None]
 ) -> None:
-    for attempt in ATTEMPTS:
+    for attempt in attempts:
         folder = tmp_path / str(attempt)
         folder.mkdir()
         with recording(folder) as run, flooded(identifier, rate_hz):
@@ -316,10 +316,10 @@ def test_a_second_ctrl_c_ends_at_once(tmp_path: Path, figure: Callable[[str], No
 
 
 def test_a_fault_stops_the_axes_on_a_flooded_bus(
-    tmp_path: Path, figure: Callable[[str], None]
+    tmp_path: Path, attempts: range, figure: Callable[[str], None]
 ) -> None:
     fault = f"  - {{fault: emergency, axis: J3, at_cycle: {STRIKE}, emcy_code: 0x2310}}\n"
-    for attempt in ATTEMPTS:
+    for attempt in attempts:
         folder = tmp_path / str(attempt)
         folder.mkdir()
         with recording(folder, fault) as run, flooded():
@@ -340,9 +340,9 @@ def test_a_fault_stops_the_axes_on_a_flooded_bus(
 
 
 def test_a_deaf_node_on_a_flooded_bus_is_named_within_the_time_limit(
-    tmp_path: Path, figure: Callable[[str], None]
+    tmp_path: Path, attempts: range, figure: Callable[[str], None]
 ) -> None:
-    for attempt in ATTEMPTS:
+    for attempt in attempts:
         folder = tmp_path / str(attempt)
         folder.mkdir()
         with (

@@ -17,7 +17,7 @@ from daq.config.cell_file import load_cell
 from daq.workflow.record import network_of
 from drivers.errors import BusError
 from tests.two_buses import LEFT, RIGHT, on_two_buses
-from tests.vcan.cells import ATTEMPTS, record_once, say, simulated, write_cell, write_simulation
+from tests.vcan.cells import record_once, say, simulated, write_cell, write_simulation
 from tests.vcan.run import INTERFACE, SECOND_INTERFACE
 
 PERIOD_US = 40_000
@@ -86,13 +86,13 @@ def test_scan_reports_the_bus_of_each_node(cell: Path) -> None:
 
 
 def test_a_run_is_complete_and_its_syncs_are_near_together(
-    cell: Path, tmp_path: Path, figure: Callable[[str], None]
+    cell: Path, tmp_path: Path, attempts: range, figure: Callable[[str], None]
 ) -> None:
     plan = tmp_path / "plan.yaml"
     how = ("--seed", "3", "--condition", "1e9", "--duration", "8", "--exchanges", "20")
     say("plan", str(cell), "--out", str(plan), *how)
     with SyncTimes(INTERFACE) as left, SyncTimes(SECOND_INTERFACE) as right:
-        for attempt in ATTEMPTS:
+        for attempt in attempts:
             log = tmp_path / f"{attempt}.mcap"
             done = record_once(cell, plan, log)
             syncs = left.taken(), right.taken()
