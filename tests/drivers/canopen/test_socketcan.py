@@ -377,7 +377,7 @@ def test_a_full_transmit_queue_is_waited_for_and_then_named(
                 return 16
             raise OSError(number, "full")
 
-    monkeypatch.setattr(bus, "_socket", Full())
+    monkeypatch.setattr(bus, "_can_socket", Full())
     message = can.Message(arbitration_id=1, is_extended_id=False)
     bus.send(message)
     assert tries == 3
