@@ -468,7 +468,8 @@ class Node:
             had_error = error_before is not ErrorCode.NONE
             if had_error and self.drive.error is ErrorCode.NONE:
                 # EMCY 0000h (CiA 301): error reset
-                self._send(0x80 + self.node_id, struct.pack("<HB5x", ErrorCode.NONE, 0))
+                emcy = struct.pack("<HB5x", ErrorCode.NONE, 0)
+                self._send(0x80 + self.node_id, emcy)
         elif FOLLOWING_ERROR_WINDOW <= index <= MAX_CURRENT:
             self._apply_settings()
 
@@ -501,7 +502,8 @@ class Node:
         self._error_history.insert(0, int(code))
         if self.nmt in (NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL):
             register = int(self.drive.error is not ErrorCode.NONE)
-            self._send(0x80 + self.node_id, struct.pack("<HB5x", code, register))
+            emcy = struct.pack("<HB5x", code, register)
+            self._send(0x80 + self.node_id, emcy)
 
     def _stored(self) -> Stored:
         return Stored(
