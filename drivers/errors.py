@@ -38,24 +38,22 @@ def error_chain(error: BaseException | None) -> tuple[BaseException, ...]:
     """Return an error and all errors behind it, nearest first:
     causes, and errors that were being handled.
 
-    Each is there once, whatever cycles they form. They are compared by identity: the `__eq__` of a
-    foreign error may raise, as that of canopen's SdoAbortedError does with any error that has no
-    abort code.
+    Each is there once, also where the errors form a cycle. They are compared by identity, because
+    `==` between foreign errors may raise: that of canopen's SdoAbortedError does, with any error
+    without an abort code.
     """
-    found: dict[int, BaseException] = {}
-    waiting = [error]
-    while waiting:
-        nearest = waiting.pop(0)
-        if nearest is not None and id(nearest) not in found:
-            found[id(nearest)] = nearest
-            waiting += [nearest.__cause__, nearest.__context__]
-    return tuple(found.values())
+    chain: dict[int, BaseException] = {}  # by identity
+    to_visit = [error]
+    while to_visit:
+        nearest = to_visit.pop(0)
+        if nearest is not None and id(nearest) not in chain:
+            chain[id(nearest)] = nearest
+            to_visit += [nearest.__cause__, nearest.__context__]
+    return tuple(chain.values())
 
 
 def text_of(error: BaseException) -> str:
-    """Return the text of an error; empty where it has none,
-    or where a foreign error fails to write it.
-    """
+    """Return the text of an error; empty where it has none, or where its `__str__` raises."""
     with suppress(Exception):
         return str(error)
     return ""
@@ -67,17 +65,15 @@ def all_notes(error: BaseException | None) -> tuple[str, ...]:
     An error that comes later, such as that of a full disk, does not carry the notes of the one that
     it hides.
     """
-    notes: dict[str, None] = {}
-    for one in error_chain(error):
-        for note in getattr(one, "__notes__", ()):
+    notes: dict[str, None] = {}  # keys alone: an ordered set
+    for link in error_chain(error):
+        for note in getattr(link, "__notes__", ()):
             notes[note] = None
     return tuple(notes)
 
 
 def stop_notes(error: BaseException | None) -> tuple[str, ...]:
-    """Return those of `all_notes` that say what a stop, or the closing of a network,
-    could not confirm.
-    """
+    """Return the notes of `all_notes` on what a stop or a closing network could not confirm."""
     return tuple(note for note in all_notes(error) if note.startswith((WHILE, POWERED)))
 
 
@@ -93,20 +89,33 @@ class NamedNode(Protocol):
     def name(self) -> str: ...
 
 
+#: Node in a message: its node id, or its axis
 Node = int | NamedNode
 
 
 def node_label(node: Node, names: Mapping[int, str] | None = None) -> str:
-    """Name a node in a message: "J3 (node 3)", or "node 3" where the axis is not known;
-    `names` are by node id.
+    """Name a node in a message: "J3 (node 3)", or "node 3" where the axis is not known.
+
+    Args:
+        node: node id or axis.
+        names: names of the axes by node id, for a node id.
     """
-    if isinstance(node, int):
-        node_id = node
-        name = (names or {}).get(node)
-    else:
-        node_id = node.node_id
+    node_id = _node_id_of(node)
+    if not isinstance(node, int):
         name = node.name
-    return f"{name} (node {node_id})" if name else f"node {node_id}"
+    elif names is not None:
+        name = names.get(node_id, "")
+    else:
+        name = ""
+    if not name:
+        return f"node {node_id}"
+    return f"{name} (node {node_id})"
+
+
+def _node_id_of(node: Node) -> int:
+    if isinstance(node, int):
+        return node
+    return node.node_id
 
 
 class DriverError(Exception):
@@ -149,10 +158,14 @@ class BusBusy(DriverError):
 
     @classmethod
     def by_own_id(cls, address: object, identifier: int) -> BusBusy:
-        """Report a device with the recorder's node id:
-        its heartbeat keeps the axes running when the recorder dies.
+        """Report a device with the recorder's node id.
+
+        The drives would take its heartbeat for the recorder's, and go on if the recorder dies.
         """
-        frame = "heartbeat" if identifier >= 0x700 else "frame"
+        if identifier >= 0x700:
+            frame = "heartbeat"
+        else:
+            frame = "frame"
         return cls(
             str(address),
             f"a {frame} {identifier:03X}h of another device, which has node id "
@@ -174,7 +187,7 @@ class NodeMissing(DriverError):
             "wiring, bit rate and node id; a drive that was switched on just now answers once it "
             "has booted: try again then"
         )
-        self.node_ids = tuple(node if isinstance(node, int) else node.node_id for node in nodes)
+        self.node_ids = tuple(map(_node_id_of, nodes))
         self.found = found
 
 
@@ -201,7 +214,7 @@ class NodeError(DriverError):
 
     def __init__(self, node: Node, reason: str) -> None:
         super().__init__(f"{node_label(node)}: {reason}")
-        self.node_id = node if isinstance(node, int) else node.node_id
+        self.node_id = _node_id_of(node)
         self.reason = reason
 
 
@@ -216,7 +229,7 @@ class ObjectAccessError(NodeError):
 
 
 def _with_remedy(found: str, expected: str, remedy: str) -> str:
-    """Add to what was found what was expected, and what to do; nothing without a remedy."""
+    """Return "FOUND; expected EXPECTED; REMEDY", or "FOUND" alone where the remedy is empty."""
     if not remedy:
         return found
     return f"{found}; expected {expected}; {remedy}"
@@ -225,7 +238,7 @@ def _with_remedy(found: str, expected: str, remedy: str) -> str:
 class SetupRefused(NodeError):
     """An amplifier is not the configured one, or cannot be set up for a recording.
 
-    Without `expected` and `remedy` the text of what was found has the rest.
+    Where `expected` and `remedy` are empty, `found` is the complete text.
     """
 
     expected: str = ""
@@ -251,12 +264,12 @@ class StateRefused(NodeError):
         remedy: str | None = None,
     ) -> None:
         if statusword is None:
-            shown = f"its heartbeat still says {found}"
-            usual = "read its error register 1001h"
+            evidence = f"its heartbeat still says {found}"
+            usual_remedy = "read its error register 1001h"
         else:
-            shown = f"statusword {statusword:#06x} says {found}"
-            usual = "check the power stage, the safety chain (STO) and the fault memory"
-        super().__init__(node, f"asked for {asked}, {shown}; {remedy or usual}")
+            evidence = f"statusword {statusword:#06x} says {found}"
+            usual_remedy = "check the power stage, the safety chain (STO) and the fault memory"
+        super().__init__(node, f"asked for {asked}, {evidence}; {remedy or usual_remedy}")
         self.asked = asked
         self.found = found
         self.statusword = statusword
@@ -292,16 +305,23 @@ class DriveFault(NodeError):
         emcy_code: int | None = None,
         remedy: str = "",
     ) -> None:
-        advice = f"; {remedy}" if remedy else ""
-        super().__init__(node, f"{reason}; stopping all axes, none is enabled again{advice}")
+        text = f"{reason}; stopping all axes, none is enabled again"
+        if remedy:
+            text = f"{text}; {remedy}"
+        super().__init__(node, text)
         self.reason = reason
         self.statusword = statusword
         self.emcy_code = emcy_code
 
 
 class SampleLost(DriverError):
-    """A SYNC cycle had no complete answer; `silent_s` is the time since any axis answered,
-    where none does any more.
+    """A SYNC cycle had no complete answer.
+
+    Args:
+        cycle: number of the cycle.
+        axes: indices of the axes without a complete answer.
+        names: of these axes.
+        silent_s: time since the last answer of any axis [s]; None where some axis still answers.
     """
 
     def __init__(
@@ -321,11 +341,13 @@ class SampleLost(DriverError):
 class MotionRefused(DriverError):
     """Motion was requested without permission, or outside the limits.
 
-    Without `expected` and `remedy` the text of what was found has the rest.
+    Where `expected` and `remedy` are empty, `found` is the complete text.
     """
 
     def __init__(self, found: str, *, expected: str = "", remedy: str = "") -> None:
-        text = f"found {found}" if remedy else found
+        text = found
+        if remedy:
+            text = f"found {found}"
         super().__init__(_with_remedy(text, expected, remedy))
         self.found = found
         self.expected = expected
@@ -335,8 +357,14 @@ class MotionRefused(DriverError):
 class MotionTimeout(DriverError):
     """A move did not end in time.
 
-    `acknowledge` is the value of statusword bit 12 where that did not come, `other_master` the
-    description of one.
+    Args:
+        move: number of the move.
+        axes: indices of the axes that did not end it.
+        nodes: of these axes.
+        waited_s: [s].
+        acknowledge: value of statusword bit 12 (set-point acknowledge, CiA 402) that was awaited
+            and did not come; None where the axes did not reach the target.
+        other_master: evidence of another master on the bus; empty where there is none.
     """
 
     def __init__(

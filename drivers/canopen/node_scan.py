@@ -18,16 +18,18 @@ from drivers.errors import ObjectAccessError
 from drivers.profiles.cia402 import State, decode
 from drivers.profiles.profile import Identity, ObjectEntry
 
+T = TypeVar("T")
+# Objects of the communication profile area (CiA 301). 1018h is the identity object.
+_DEVICE_TYPE = ObjectEntry(0x1000, 0, 32)
+_DEVICE_NAME_INDEX = 0x1008
 VENDOR_ID = ObjectEntry(0x1018, 1, 32)
 PRODUCT_CODE = ObjectEntry(0x1018, 2, 32)
 REVISION = ObjectEntry(0x1018, 3, 32)
 SERIAL = ObjectEntry(0x1018, 4, 32)
-T = TypeVar("T")
+#: A node whose transfer never ends must not keep the others from being found.
 SCAN_POLICY = SdoPolicy(attempts=2, transfer_s=1.0, most_bytes=256)
-"""One node that never ends must not keep the others from being found."""
-NODE_S = 3.0  #: After this time, nothing more is asked of a node
-SCAN_S = 30.0  #: After this time, nothing more is asked of any node
-_DEVICE_TYPE = ObjectEntry(0x1000, 0, 32)
+NODE_S = 3.0  #: Longest time to send requests to one node
+SCAN_S = 30.0  #: Longest time to send requests to all nodes together
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,8 +69,9 @@ def scan(
         BusBusy: another master commands this bus.
         BusError: the bus cannot be opened, or is lost.
     """
-    place = BusAddress.parse(address) if isinstance(address, str) else address
-    link = Link(place, SdoPolicy(), time.monotonic_ns)
+    if isinstance(address, str):
+        address = BusAddress.parse(address)
+    link = Link(address, SdoPolicy(), time.monotonic_ns)
     link.open()
     try:
         link.require_quiet(LISTEN_S)
@@ -79,67 +82,106 @@ def scan(
 
 def scan_link(link: Link, node_ids: Sequence[int], wait_s: float) -> tuple[FoundNode, ...]:
     """Find all nodes that answer an SDO request or send a heartbeat within a time."""
-    end_ns = link.clock() + round((wait_s + SCAN_S) * 1e9)
+    scan_end_ns = link.clock() + round((wait_s + SCAN_S) * 1e9)
     answered = answering(link, node_ids, wait_s)
-    several = {n for n in answered if link.answered[n] > 1 and SDO_REQUEST + n not in link.foreign}
-    alive = sorted(set(answered) | (set(link.nmt) & set(node_ids)))
-    nothing = (None, None, None, None, None)
-    found = [
-        _describe(link, n, end_ns) if n in answered else (FoundNode(n, *nothing), 0) for n in alive
-    ]
-    link.hear_beats(max((period_ms for _, period_ms in found), default=0))  # of all nodes at once
+    # Counted now: the requests that follow are answered too.
+    answered_twice = [node_id for node_id in answered if _answered_twice(link, node_id)]
+    with_heartbeat = set(link.nmt) & set(node_ids)
+    found = []
+    periods_ms = {}
+    for node_id in sorted(with_heartbeat.union(answered)):
+        if node_id in answered:
+            node, period_ms = _describe(link, node_id, scan_end_ns)
+        else:
+            node = _unanswering_node(node_id)
+            period_ms = 0
+        found.append(node)
+        periods_ms[node_id] = period_ms
+    # Once for all nodes: their heartbeats arrive at the same time.
+    slowest_ms = max(periods_ms.values(), default=0)
+    link.hear_beats(slowest_ms)
     nodes = []
-    for node, period_ms in found:
-        shared = link.shared_id(node.node_id, period_ms)
-        if node.node_id in several and not shared:
+    for node in found:
+        shared = link.shared_id(node.node_id, periods_ms[node.node_id])
+        if node.node_id in answered_twice and not shared:
             shared = "two answers to one request for 1000h:00"
         nodes.append(replace(node, nmt=link.nmt.get(node.node_id), shared=shared))
     return tuple(nodes)
 
 
-def _describe(link: Link, node_id: int, scan_end_ns: int) -> tuple[FoundNode, int]:
-    """Read what a node reports of itself until the scan ends, and the period of its heartbeat [ms];
-    0 for none.
+def _answered_twice(link: Link, node_id: int) -> bool:
+    """Whether a node sent two answers to one request; not where another program asks it too."""
+    asked_by_others = SDO_REQUEST + node_id in link.foreign
+    return link.answered[node_id] > 1 and not asked_by_others
 
-    An object that it reports badly does not keep the others from it.
+
+def _unanswering_node(node_id: int) -> FoundNode:
+    """Return a node that sends a heartbeat and answers no SDO request."""
+    return FoundNode(
+        node_id,
+        identity=None,
+        revision=None,
+        device_name=None,
+        nmt=None,
+        statusword=None,
+    )
+
+
+def _describe(link: Link, node_id: int, scan_end_ns: int) -> tuple[FoundNode, int]:
+    """Read the objects that describe a node, as far as there is time.
+
+    A bad answer to one of them is noted as a problem, and the others are still read.
+
+    Returns:
+        the node, and the period of its heartbeat (1017h) [ms], 0 for none.
     """
     access = link.objects(node_id, SCAN_POLICY)
-    problems = list[str]()
-    end_ns = min(link.clock() + round(NODE_S * 1e9), scan_end_ns)
-    unasked = f"the rest was not asked: its answers took longer than {NODE_S:g} s"
-    if link.clock() >= scan_end_ns:
-        unasked = (
+    problems: list[str] = []
+    begun_ns = link.clock()
+    node_end_ns = begun_ns + round(NODE_S * 1e9)
+    end_ns = min(node_end_ns, scan_end_ns)
+    if begun_ns < scan_end_ns:
+        out_of_time = f"the rest was not asked: its answers took longer than {NODE_S:g} s"
+    else:
+        out_of_time = (
             f"nothing was asked of it: the scan was over after {SCAN_S:g} s; is the bus flooded?"
         )
 
-    def reported(read: Callable[[], T]) -> T | None:
+    def read_or_note(read: Callable[[], T]) -> T | None:
         if link.clock() >= end_ns:
-            if unasked not in problems:
-                problems.append(unasked)
+            if out_of_time not in problems:
+                problems.append(out_of_time)
             return None
         try:
             return read()
         except ObjectAccessError as error:
+            # An abort is no problem: most of these objects are optional.
             if error.abort_code is None:
                 problems.append(f"object {error.entry}: {error.reason}")
         return None
 
-    identity = reported(partial(read_identity, access))
-    data = reported(partial(access.read_bytes, 0x1008, 0))
-    if data is None:
-        name = None
-    else:
-        name = data.rstrip(b"\0 ").decode("utf-8", "replace")
-    revision, statusword, period_ms = (
-        reported(partial(access.read, entry)) for entry in (REVISION, STATUSWORD, HEARTBEAT_TIME)
+    identity = read_or_note(partial(read_identity, access))
+    name_bytes = read_or_note(partial(access.read_bytes, _DEVICE_NAME_INDEX, 0))
+    device_name = None
+    if name_bytes is not None:
+        device_name = name_bytes.rstrip(b"\0 ").decode("utf-8", "replace")
+    revision = read_or_note(partial(access.read, REVISION))
+    statusword = read_or_note(partial(access.read, STATUSWORD))
+    period_ms = read_or_note(partial(access.read, HEARTBEAT_TIME))
+    node = FoundNode(
+        node_id,
+        identity,
+        revision,
+        device_name,
+        nmt=None,
+        statusword=statusword,
+        problems=tuple(problems),
     )
-    return FoundNode(
-        node_id, identity, revision, name, None, statusword, problems=tuple(problems)
-    ), period_ms or 0
+    return node, period_ms or 0
 
 
 def read_identity(access: ObjectAccess) -> Identity:
-    """Read object 1018h, of which CiA 301 requires the vendor only: the rest may be None."""
+    """Read object 1018h; CiA 301 requires the vendor id alone, the rest may be None."""
     vendor_id = access.read(VENDOR_ID)
     product_code = access.read_optional(PRODUCT_CODE, any_abort=True)
     serial = access.read_optional(SERIAL, any_abort=True)
@@ -149,31 +191,30 @@ def read_identity(access: ObjectAccess) -> Identity:
 def answering(link: Link, node_ids: Sequence[int], wait_s: float) -> tuple[int, ...]:
     """Return the nodes that answer an SDO request; all are asked at once, and share the time.
 
-    One that sends its boot-up message meanwhile is asked again: it was still booting when it was
-    asked.
+    A node that sends its boot-up message meanwhile is asked once more: it was still booting when
+    the first request came.
     """
     asked = set(node_ids)
+    asked_again: set[int] = set()
     link.answered.clear()
-    began_ns = link.clock()
-    again: set[int] = set()
+    begun_ns = link.clock()
 
-    def booted() -> list[int]:
-        return [
-            n
-            for n in sorted(asked - again - link.answered.keys())
-            if link.booted_since(n, began_ns)
-        ]
+    def to_ask_again() -> list[int]:
+        unanswered = asked - link.answered.keys()
+        candidates = sorted(unanswered - asked_again)
+        return [node_id for node_id in candidates if link.booted_since(node_id, begun_ns)]
 
-    _ask(link, node_ids)
-    end_ns = began_ns + round(wait_s * 1e9)
-    while link.wait(
-        (end_ns - link.clock()) * 1e-9, lambda: asked <= link.answered.keys() or bool(booted())
-    ):
-        up = booted()
-        if not up:
+    def can_go_on() -> bool:
+        return asked <= link.answered.keys() or bool(to_ask_again())
+
+    _request_device_type(link, node_ids)
+    end_ns = begun_ns + round(wait_s * 1e9)
+    while link.wait((end_ns - link.clock()) * 1e-9, can_go_on):
+        booted = to_ask_again()
+        if not booted:
             break
-        again.update(up)
-        _ask(link, up)
+        asked_again.update(booted)
+        _request_device_type(link, booted)
     return tuple(sorted(asked & link.answered.keys()))
 
 
@@ -181,10 +222,12 @@ def free_ids(link: Link, node_ids: Sequence[int], wait_s: float) -> tuple[int, .
     """Return the node ids of which no frame came since the bus was opened,
     nor an SDO answer within a time.
     """
-    _ask(link, node_ids)
-    link.wait(wait_s)  # all of it: a device without SDO server is known by its heartbeat alone
+    _request_device_type(link, node_ids)
+    # The full time: a device without SDO server is known by its heartbeat alone.
+    link.wait(wait_s)
     return tuple(node_id for node_id in node_ids if node_id not in link.heard)
 
 
-def _ask(link: Link, node_ids: Sequence[int]) -> None:
+def _request_device_type(link: Link, node_ids: Sequence[int]) -> None:
+    """Send each node a request for 1000h, which every CANopen device has."""
     link.send([upload_request(node_id, _DEVICE_TYPE) for node_id in node_ids])

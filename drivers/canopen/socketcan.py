@@ -19,7 +19,6 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import partial
-from operator import sub
 from pathlib import Path
 from typing import NamedTuple
 
@@ -32,22 +31,26 @@ from drivers.canopen.capture import FRAME, RECORD, RecordKind
 RECEIVE_BUFFER_BYTES = 4 << 20
 #: Time for the capture process to start; a loaded machine is slow to start an interpreter
 START_S = 20.0
-END_S = 1.0
+END_S = 1.0  #: Time for the capture process to end by itself
 SEND_S = 0.1  #: Longest time of a full transmit queue: at 10 kbit/s a frame takes 13 ms
-RETRY_S = 0.0002
-# asm-generic/socket.h; the first is allowed to CAP_NET_ADMIN
-SO_RCVBUFFORCE = 33
+SEND_RETRY_S = 0.0002
+# asm-generic/socket.h
+SO_RCVBUFFORCE = 33  #: Exceeds net.core.rmem_max; needs CAP_NET_ADMIN
 SO_TIMESTAMPNS = 35
 CAN_RAW_ERR_FILTER = 2  # linux/can/raw.h; Python's socket has no name for it
-ERROR_CLASSES = 0x4 | 0x40 | 0x100
-"""Controller problems (error passive, overflow), bus-off, restarted: linux/can/error.h.
-
-Single bus errors are not requested: a bus without a second node sends thousands a second.
-"""
+# linux/can/error.h: classes of error frames
+CAN_ERR_CRTL = 0x004  #: Controller problems: error passive, overflow
+CAN_ERR_BUSOFF = 0x040
+CAN_ERR_RESTARTED = 0x100
+#: Without single bus errors: a bus without a second node sends thousands a second.
+ERROR_CLASSES = CAN_ERR_CRTL | CAN_ERR_BUSOFF | CAN_ERR_RESTARTED
+# linux/can.h: flags in the identifier of struct can_frame, and masks of the identifier itself
 _EXTENDED = 0x8000_0000
 _REMOTE = 0x4000_0000
 _ERROR = 0x2000_0000
-_PAIR_BYTES = 1 << 18
+_BASE_MASK = 0x7FF
+_EXTENDED_MASK = 0x1FFF_FFFF
+_RECORD_BUFFER_BYTES = 1 << 18
 _FILTER = struct.Struct("=II")  #: struct can_filter
 
 
@@ -62,7 +65,11 @@ class Losses(NamedTuple):
 
     def since(self, earlier: Losses) -> Losses:
         """Return the losses since an earlier reading."""
-        return Losses(*map(sub, self, earlier))
+        return Losses(
+            self.kernel - earlier.kernel,
+            self.interface - earlier.interface,
+            self.backlog - earlier.backlog,
+        )
 
 
 NO_LOSSES = Losses()
@@ -88,29 +95,28 @@ def losses_of(bus: can.BusABC) -> Losses:
 
 
 def receive_only(bus: can.BusABC, wanted: Sequence[tuple[int, int]]) -> None:
-    """Let the kernel discard what a bus does not need, where it can:
-    see `SocketcanBus.receive_only`.
-    """
-    narrow: Callable[[Sequence[tuple[int, int]]], None] | None = getattr(bus, "receive_only", None)
-    if narrow is not None:
-        narrow(wanted)
+    """Let the kernel discard unwanted frames, where a bus can: see `SocketcanBus.receive_only`."""
+    set_filters: Callable[[Sequence[tuple[int, int]]], None] | None
+    set_filters = getattr(bus, "receive_only", None)
+    if set_filters is not None:
+        set_filters(wanted)
 
 
 def read_until_ns(bus: can.BusABC) -> int | None:
-    """Return the monotonic time up to which every frame of a bus has been received;
-    None where frames have no stamps.
+    """Return the monotonic time up to which every frame of a bus has been received [ns].
 
-    On a bus with stamps our own SYNC comes back, in its place among the other frames.
+    None where frames have no stamps. On a bus with stamps our own SYNC comes back, in its place
+    among the other frames.
     """
     until_ns: int | None = getattr(bus, "read_until_ns", None)
     return until_ns
 
 
 def lags_behind(bus: can.BusABC, time_ns: int) -> bool:
-    """Return whether frames from before a monotonic time may still come;
-    never on a bus whose frames have no stamps.
+    """Return whether frames from before a monotonic time may still come.
 
-    A bus that has received nothing yet has read until 0, and is behind too.
+    A bus that has received nothing yet has read until 0, and lags too. A bus whose frames have no
+    stamps never lags.
     """
     until_ns = read_until_ns(bus)
     return until_ns is not None and until_ns < time_ns
@@ -132,20 +138,20 @@ def open_socketcan(
         OSError: there is no such interface, or no permission to use it.
         can.CanInitializationError: the interface is down, or the capture process did not start.
     """
-    handle = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
+    can_socket = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
     try:
-        remarks = _configure(handle, channel, receive_buffer_bytes)
+        remarks = _configure(can_socket, channel, receive_buffer_bytes)
     except BaseException:
-        handle.close()
+        can_socket.close()
         raise
-    return SocketcanBus(channel, handle, backlog_records, remarks)
+    return SocketcanBus(channel, can_socket, backlog_records, remarks)
 
 
 def receive_within(bus: can.BusABC, timeout: float | None = None) -> can.Message | None:
     """Return the next frame of a bus; None if none comes within a time [s].
 
-    This is `can.BusABC.recv` by the monotonic clock. The one of python-can waits by the wall clock:
-    one that is set back meanwhile makes it wait so much longer, and SYNC is not sent until then.
+    This is `can.BusABC.recv` by the monotonic clock. python-can's own measures the time by the wall
+    clock: when that is set back by an hour, it waits an hour longer, and no SYNC is sent.
     """
     left_s = timeout
     end_s = None if timeout is None else time.monotonic() + timeout
@@ -161,32 +167,36 @@ def receive_within(bus: can.BusABC, timeout: float | None = None) -> can.Message
 
 
 class BurstBus(can.BusABC):
-    """A bus of which one call reads a burst;
-    its other frames are returned without python-can's clock and logging.
+    """A bus that reads many frames with one system call.
+
+    All but the first of them are returned without python-can's clock and logging.
     """
 
     _received: deque[can.Message]
 
     def take(self) -> can.Message | None:
-        """Return a frame that was received with the one before;
-        None where the bus has to be asked.
-        """
+        """Return a frame that is received already; None where the bus must be read for the next."""
         if self._received and self._filters is None:
             return self._received.popleft()
         return None
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
+        # The same as `take`, without another call: this runs for every frame.
         if self._received and self._filters is None:
             return self._received.popleft()
         return receive_within(self, timeout)
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        already_filtered = False
         if not self._received:
             self._fill(timeout)
-        return (self._received.popleft() if self._received else None), False
+        if not self._received:
+            return None, already_filtered
+        return self._received.popleft(), already_filtered
 
     @abstractmethod
-    def _fill(self, timeout_s: float | None) -> None: ...
+    def _fill(self, timeout_s: float | None) -> None:
+        """Append frames to `_received`; waits for the first of them at most this long."""
 
 
 class SocketcanBus(BurstBus):
@@ -194,7 +204,7 @@ class SocketcanBus(BurstBus):
 
     Args:
         channel: name of the interface, for messages.
-        handle: bound socket; the bus closes it.
+        can_socket: bound socket; the bus closes it.
         backlog_records: frames that may wait in the capture process.
         remarks: for the operator, on how it was opened.
 
@@ -205,7 +215,7 @@ class SocketcanBus(BurstBus):
     def __init__(
         self,
         channel: str,
-        handle: socket.socket,
+        can_socket: socket.socket,
         backlog_records: int = capture.BACKLOG_RECORDS,
         remarks: tuple[str, ...] = (),
     ) -> None:
@@ -215,17 +225,19 @@ class SocketcanBus(BurstBus):
         self.remarks = remarks
         self._channel = channel
         self._received = deque()
-        self._chunks: deque[bytes] = deque()
-        self._ready = False
-        self._end: str | None = None
-        self._socket = handle
+        self._unparsed: deque[bytes] = deque()  # from the capture process
+        self._ready = False  # whether the capture process reads
+        self._end_reason: str | None = None
+        self._can_socket = can_socket
         self._process: subprocess.Popen[bytes] | None = None
-        self._pair, theirs = socket.socketpair()
+        self._record_socket, capture_end = socket.socketpair()
         try:
-            with theirs:
-                self._pair.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _PAIR_BYTES)
-                theirs.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _PAIR_BYTES)
-                self._process = _spawn(handle, theirs, channel, backlog_records)
+            with capture_end:
+                self._record_socket.setsockopt(
+                    socket.SOL_SOCKET, socket.SO_RCVBUF, _RECORD_BUFFER_BYTES
+                )
+                capture_end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _RECORD_BUFFER_BYTES)
+                self._process = _spawn(can_socket, capture_end, channel, backlog_records)
             self.capture_pid = self._process.pid
             self._wait_until_ready()
             super().__init__(channel=channel)
@@ -235,9 +247,9 @@ class SocketcanBus(BurstBus):
 
     def _wait_until_ready(self) -> None:
         """Wait for the capture process: before it reads, another master would not be heard."""
-        deadline = time.monotonic() + START_S
+        deadline_s = time.monotonic() + START_S
         while not self._ready:
-            left_s = deadline - time.monotonic()
+            left_s = deadline_s - time.monotonic()
             if left_s <= 0:
                 raise can.CanInitializationError(
                     f"the capture process did not start within {START_S:g} s"
@@ -245,95 +257,114 @@ class SocketcanBus(BurstBus):
             self._fill(left_s)
 
     def fileno(self) -> int:
-        return self._pair.fileno()
+        return self._record_socket.fileno()
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         if msg.is_fd:
             raise can.CanOperationError(f"no CAN FD frames on this bus: {msg}")
-        flags = (
-            _EXTENDED * msg.is_extended_id
-            | _REMOTE * msg.is_remote_frame
-            | _ERROR * msg.is_error_frame
-        )
-        frame = FRAME.pack(msg.arbitration_id | flags, msg.dlc, bytes(msg.data))
-        deadline = time.monotonic() + (SEND_S if timeout is None else timeout)
+        can_id = msg.arbitration_id
+        if msg.is_extended_id:
+            can_id |= _EXTENDED
+        if msg.is_remote_frame:
+            can_id |= _REMOTE
+        if msg.is_error_frame:
+            can_id |= _ERROR
+        frame = FRAME.pack(can_id, msg.dlc, bytes(msg.data))
+        if timeout is None:
+            timeout = SEND_S
+        deadline_s = time.monotonic() + timeout
         while True:
             try:
-                self._socket.send(frame, socket.MSG_DONTWAIT)
+                self._can_socket.send(frame, socket.MSG_DONTWAIT)
             except OSError as error:
-                # The queue of the interface, or the buffer of the socket, is full.
-                if error.errno not in (errno.ENOBUFS, errno.EAGAIN):
+                queue_is_full = error.errno in (errno.ENOBUFS, errno.EAGAIN)
+                if not queue_is_full:
                     raise can.CanOperationError(_reason(error.errno or errno.EIO)) from error
                 # The interface's queue holds ten frames by default; a burst of set-points is
                 # longer.
-                if time.monotonic() >= deadline:
+                if time.monotonic() >= deadline_s:
                     raise can.CanOperationError(
-                        f"the transmit queue stays full for {SEND_S:g} s: does any node "
+                        f"the transmit queue stays full for {timeout:g} s: does any node "
                         "acknowledge frames?"
                     ) from error
-                time.sleep(RETRY_S)
+                time.sleep(SEND_RETRY_S)
             else:
                 return
 
     def receive_only(self, wanted: Sequence[tuple[int, int]]) -> None:
-        """Let the kernel discard base frames other than these, given as identifier and mask,
-        however many come.
+        """Let the kernel discard unwanted frames, so that a flood of them costs nothing.
 
         Error frames are still received.
+
+        Args:
+            wanted: identifier and mask of base data frames.
         """
-        filters = b"".join(
-            _FILTER.pack(number, mask | _EXTENDED | _REMOTE) for number, mask in wanted
-        )
-        with suppress(OSError):  # a socket that is no CAN_RAW has no filters: it receives all
-            self._socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, filters)
+        filters = bytearray()
+        for identifier, mask in wanted:
+            # Flags in the mask that are not in the identifier: only a base data frame matches.
+            filters += _FILTER.pack(identifier, mask | _EXTENDED | _REMOTE)
+        # A socket that is no CAN_RAW has no filters: it receives all.
+        with suppress(OSError):
+            self._can_socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, filters)
 
     def _fill(self, timeout_s: float | None) -> None:
         """Take records from the capture process, waiting for the first of them."""
-        if self._end is not None:
-            raise can.CanOperationError(self._end)
+        if self._end_reason is not None:
+            raise can.CanOperationError(self._end_reason)
+        # Bytes that an interrupted call received and did not parse come first.
+        unparsed_bytes = sum(map(len, self._unparsed))
         try:
-            # Bytes that an interrupted call received and did not parse come first.
-            if sum(map(len, self._chunks)) < RECORD.size and not self._take(timeout_s):
+            if unparsed_bytes < RECORD.size and not self._read_records(timeout_s):
                 return
         except (OSError, ValueError) as error:
             raise can.CanOperationError(str(error)) from error
-        if not self._chunks[-1]:
-            self._end = (
-                f"the capture process ended by itself ({self._wait()}); frames since then are lost"
+        end_of_file = not self._unparsed[-1]
+        if end_of_file:
+            exit_code = self._wait()
+            self._end_reason = (
+                f"the capture process ended by itself ({exit_code}); frames since then are lost"
             )
-            raise can.CanOperationError(self._end)
+            raise can.CanOperationError(self._end_reason)
         self._parse()
-        if self._end is not None and not self._received:
-            raise can.CanOperationError(self._end)
+        if self._end_reason is not None and not self._received:
+            raise can.CanOperationError(self._end_reason)
 
-    def _take(self, timeout_s: float | None) -> bool:
-        """Append the bytes of the capture process to the chunks; returns whether there were any."""
-        # One call into C, so that no signal handler's exception comes between receiving and
-        # appending.
-        receive = partial(map, self._pair.recv, (_PAIR_BYTES,))
+    def _read_records(self, timeout_s: float | None) -> bool:
+        """Append bytes of the capture process to `_unparsed`, empty ones at end of file.
+
+        Returns:
+            False where none came in time.
+        """
+        # `extend` over `map` receives and appends in one call into C: no exception of a signal
+        # handler can come in between and lose the bytes.
+        receive = partial(map, self._record_socket.recv, (_RECORD_BUFFER_BYTES,))
         try:
             # Next to a busy thread each system call may wait for the interpreter lock: try without
             # select first.
-            self._chunks.extend(receive((socket.MSG_DONTWAIT,)))
+            self._unparsed.extend(receive((socket.MSG_DONTWAIT,)))
         except BlockingIOError:
-            if timeout_s == 0 or not select.select((self._pair,), (), (), timeout_s)[0]:
+            if timeout_s == 0:
                 return False
-            self._chunks.extend(receive((0,)))
+            readable, _, _ = select.select((self._record_socket,), (), (), timeout_s)
+            if not readable:
+                return False
+            self._unparsed.extend(receive((0,)))
         return True
 
     def _parse(self) -> None:
-        """Parse the chunks into frames; an exception meanwhile, such as Ctrl-C,
-        leaves them for the next time.
+        """Parse the bytes of the capture process into frames.
+
+        An exception meanwhile, such as Ctrl-C, leaves them for the next time.
         """
-        chunk = b"".join(self._chunks)
-        whole = len(chunk) - len(chunk) % RECORD.size
-        rest = deque((chunk[whole:],))
+        unparsed = b"".join(self._unparsed)
+        complete_bytes = len(unparsed) - len(unparsed) % RECORD.size
+        rest = deque((unparsed[complete_bytes:],))
         received = self._received.copy()
         ready = self._ready
-        end = self._end
+        end_reason = self._end_reason
         lost: list[int] = list(self.losses)
         monotonic_ns = self.read_until_ns
-        for record in RECORD.iter_unpack(memoryview(chunk)[:whole]):
+        for record in RECORD.iter_unpack(memoryview(unparsed)[:complete_bytes]):
             kernel_ns, monotonic_ns, *lost, can_id, kind, length, own, local, data = record
             if kind == RecordKind.FRAME:
                 received.append(
@@ -342,14 +373,14 @@ class SocketcanBus(BurstBus):
             elif kind == RecordKind.READY:
                 ready = True
             elif kind == RecordKind.END:
-                end = _reason(can_id)
+                end_reason = _reason(can_id)
         losses = Losses(*lost)
         until_ns = max(monotonic_ns, self.read_until_ns)
-        # No call from here on: the state changes whole, or not at all.
-        self._chunks = rest
+        # Assignments alone, without a call: an exception changes all of the state, or none of it.
+        self._unparsed = rest
         self._received = received
         self._ready = ready
-        self._end = end
+        self._end_reason = end_reason
         self.losses = losses
         self.read_until_ns = until_ns
 
@@ -357,17 +388,26 @@ class SocketcanBus(BurstBus):
         self, kernel_ns: int, monotonic_ns: int, can_id: int, data: bytes, own: bool, local: bool
     ) -> CapturedMessage:
         extended = bool(can_id & _EXTENDED)
+        remote = bool(can_id & _REMOTE)
         error = bool(can_id & _ERROR)
+        if extended or error:
+            identifier = can_id & _EXTENDED_MASK
+        else:
+            identifier = can_id & _BASE_MASK
+        dlc = len(data)
+        if remote:
+            # It requests so many bytes, and carries none.
+            data = b""
         message = CapturedMessage(
             timestamp=kernel_ns * 1e-9,
-            arbitration_id=can_id & (0x1FFF_FFFF if extended or error else 0x7FF),
+            arbitration_id=identifier,
             is_extended_id=extended,
-            is_remote_frame=bool(can_id & _REMOTE),
+            is_remote_frame=remote,
             is_error_frame=error,
             is_rx=not own,
             channel=self._channel,
-            data=b"" if can_id & _REMOTE else data,
-            dlc=len(data),
+            data=data,
+            dlc=dlc,
         )
         message.kernel_ns = kernel_ns
         message.monotonic_ns = monotonic_ns
@@ -379,11 +419,11 @@ class SocketcanBus(BurstBus):
         self._close()
 
     def _close(self) -> None:
-        self._end = self._end or "is closed"
+        self._end_reason = self._end_reason or "is closed"
         # The capture process ends when its parent's end of the pair is closed.
-        self._pair.close()
+        self._record_socket.close()
         self._wait()
-        self._socket.close()
+        self._can_socket.close()
 
     def _wait(self) -> int | None:
         """Wait for the end of the capture process; returns its exit code."""
@@ -399,17 +439,14 @@ class SocketcanBus(BurstBus):
 def _spawn(
     bus: socket.socket, out: socket.socket, channel: str, backlog_records: int
 ) -> subprocess.Popen[bytes]:
-    numbers = (bus.fileno(), out.fileno())
-    program = (
-        str(Path(capture.__file__).resolve()),
-        *map(str, numbers),
-        channel,
-        str(backlog_records),
-    )
+    """Start the capture process; it inherits the two sockets."""
+    descriptors = (bus.fileno(), out.fileno())
+    script = str(Path(capture.__file__).resolve())
+    arguments = (*map(str, descriptors), channel, str(backlog_records))
     return subprocess.Popen(
         # Isolated from the user's environment, and without the packages of this one.
-        [sys.executable, "-I", "-S", *program],
-        pass_fds=numbers,
+        [sys.executable, "-I", "-S", script, *arguments],
+        pass_fds=descriptors,
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
         # A terminal's Ctrl-C goes to the whole process group, but stopping the axes needs the
@@ -418,7 +455,9 @@ def _spawn(
     )
 
 
-def _configure(handle: socket.socket, channel: str, receive_buffer_bytes: int) -> tuple[str, ...]:
+def _configure(
+    can_socket: socket.socket, channel: str, receive_buffer_bytes: int
+) -> tuple[str, ...]:
     """Set the options of a CAN_RAW socket and bind it; returns remarks for the operator."""
     for level, option, value in (
         (socket.SOL_SOCKET, SO_TIMESTAMPNS, 1),
@@ -426,30 +465,32 @@ def _configure(handle: socket.socket, channel: str, receive_buffer_bytes: int) -
         (socket.SOL_CAN_RAW, CAN_RAW_ERR_FILTER, ERROR_CLASSES),
         (socket.SOL_CAN_RAW, socket.CAN_RAW_RECV_OWN_MSGS, 1),
     ):
-        handle.setsockopt(level, option, value)
+        can_socket.setsockopt(level, option, value)
     try:
-        handle.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, receive_buffer_bytes)
+        can_socket.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, receive_buffer_bytes)
     except PermissionError:
-        handle.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, receive_buffer_bytes)
-    handle.bind((channel,))
-    if number := handle.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR):
-        raise can.CanInitializationError(_reason(number))
+        can_socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, receive_buffer_bytes)
+    can_socket.bind((channel,))
+    error_number = can_socket.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
+    if error_number:
+        raise can.CanInitializationError(_reason(error_number))
     # The kernel doubles the requested size for its own book-keeping, and reports the double.
-    given = handle.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // 2
-    if given >= receive_buffer_bytes:
+    granted_bytes = can_socket.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // 2
+    if granted_bytes >= receive_buffer_bytes:
         return ()
-    return (
-        f"the kernel gave {given >> 10} KiB of receive buffer instead of "
+    remark = (
+        f"the kernel gave {granted_bytes >> 10} KiB of receive buffer instead of "
         f"{receive_buffer_bytes >> 10} KiB: raise net.core.rmem_max, or let the recorder have "
-        "CAP_NET_ADMIN",
+        "CAP_NET_ADMIN"
     )
+    return (remark,)
 
 
-def _reason(number: int) -> str:
+def _reason(error_number: int) -> str:
     """Explain an error of the socket."""
-    name = errno.errorcode.get(number, str(number))
-    if number == errno.ENETDOWN:
+    name = errno.errorcode.get(error_number, str(error_number))
+    if error_number == errno.ENETDOWN:
         return f"the interface is down ({name}): ip link set ... up"
-    if number in (errno.ENODEV, errno.ENXIO):
+    if error_number in (errno.ENODEV, errno.ENXIO):
         return f"the interface is gone ({name}): was the adapter unplugged?"
-    return f"{os.strerror(number)} ({name})"
+    return f"{os.strerror(error_number)} ({name})"

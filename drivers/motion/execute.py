@@ -377,7 +377,7 @@ class _Execution:
         failures to confirm it are in `problems`.
         """
         self._bus.outgoing.clear()  # a set-point that was not sent yet must not start a move now
-        self._bus.spare = nothing_to_send
+        self._bus.low_priority = nothing_to_send
         self.report(None, EventKind.STOP, 0, "quick stop, then power off, on all axes")
         self.problems = []
         self._network.begin_closing()

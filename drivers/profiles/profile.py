@@ -14,9 +14,9 @@ from enum import Enum
 class Amplitude(Enum):
     """Convention of a current value; peak against RMS alone is a 41 % gain error.
 
-    QUADRATURE is the torque-making component of a field-oriented loop, in the length that the
-    drive's transformation gives it. UNSTATED is a convention that was chosen when the drive was set
-    up and that it does not report.
+    QUADRATURE is the q-axis current of a field-oriented loop; its scale depends on the drive's
+    Clarke transformation (amplitude or power invariant). UNSTATED is a convention that was chosen
+    at commissioning and that the drive does not report.
     """
 
     PEAK = "peak"
@@ -50,7 +50,7 @@ class FactBasis(Enum):
 
 
 class Mapping(Enum):
-    """Effect of a drive's save on PDO mappings."""
+    """Whether a drive's save includes its PDO mappings."""
 
     STORED = "stored"
     SEPARATE = "separate"
@@ -60,10 +60,13 @@ class Mapping(Enum):
 class ScaleForm(Enum):
     """Known conversions from a raw number to ampere; each becomes a `CurrentScale`.
 
-    PRODUCT: factor × objects. PER_MILLE: of a rated current in the drive [mA]. FIXED_STEP: ampere
-    per digit. DIGITS_OF_PEAK: digits of the drive's peak current, which the operator enters.
-    DIGITS_OF_REPORTED_PEAK: the same, with the peak current in the drive [mA]. SWITCHED_PER_MILLE:
-    of the rated current or of it over √2, by an object.
+    PRODUCT: factor × objects.
+    PER_MILLE: per mille of the rated current, which an object of the drive has [mA].
+    FIXED_STEP: ampere per digit.
+    DIGITS_OF_PEAK: so many digits are the drive's peak current, which the operator enters.
+    DIGITS_OF_REPORTED_PEAK: the same, where an object of the drive has the peak current [mA].
+    SWITCHED_PER_MILLE: per mille of the rated current, or of the rated current over √2; the value
+    of another object decides.
     """
 
     PRODUCT = "product"
@@ -89,21 +92,29 @@ class ObjectEntry:
 
 @dataclass(frozen=True, slots=True)
 class CurrentScale:
-    """Ampere per raw unit = factor × product of the objects' values × weight of the switch's value.
+    """Conversion of a raw current to ampere.
 
-    CiA 402 generic: factor 1e-6 (per mille of mA) × 6075h.
+    Ampere per raw unit = factor × product of the values of `objects` × weight of the value of
+    `switch`. CiA 402 without a vendor's objects: factor 1e-6
+    (per mille of mA) × motor rated current 6075h.
     """
 
-    factor: float  #: of the product
-    objects: tuple[ObjectEntry, ...]  #: of the product; they are read by SDO at connect
-    form: ScaleForm = ScaleForm.PRODUCT  #: in a profile file
-    #: object whose value selects a weight, None where there is no choice
+    factor: float
+    objects: tuple[ObjectEntry, ...]  #: they are read by SDO at connect
+    form: ScaleForm = ScaleForm.PRODUCT  #: how a profile file writes it
+    #: object whose value is the index of the weight; None where there is one weight
     switch: ObjectEntry | None = None
-    weights: tuple[float, ...] = (1.0,)  #: for the switch's values 0, 1, and so on
+    weights: tuple[float, ...] = (1.0,)
 
     def ampere_per_unit(self, values: Sequence[int], choice: int = 0) -> float:
-        """Return the scale for the values of the objects and of the switch;
-        IndexError for an unknown one.
+        """Return the scale [A per raw unit].
+
+        Args:
+            values: of `objects`, in their order.
+            choice: value of `switch`.
+
+        Raises:
+            IndexError: there is no weight for this choice.
         """
         if not 0 <= choice < len(self.weights):
             raise IndexError(choice)
@@ -125,7 +136,7 @@ class Thermometer:
     """Object with the temperature of the motor or the drive."""
 
     entry: ObjectEntry
-    kelvin_per_unit: float  #: its unit; zero is 0 °C
+    kelvin_per_unit: float  #: its unit; a raw value of 0 is 0 °C
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,7 +145,8 @@ class Save:
 
     command: ObjectEntry  #: object to write
     signature: int  #: its value ("save" of CiA 301)
-    #: whether it saves PDO mappings too; those of a recording must then be restored before
+    #: whether it saves PDO mappings too; the drive's own mappings must then be restored before a
+    #: save, so that it does not store those of a recording
     mapping: Mapping
 
 
@@ -169,8 +181,8 @@ class DriveProfile:
     #: the motor's rated values in the drive, None where it has none
     rated: RatedMotor | None = None
     save: Save | None = None  #: command that saves, None where there is none or it is unknown
-    #: Bit of statusword 6041h that the drive inverts whenever it refreshes its PDO, None when it
-    #: has none: then frozen data show as values that do not change in a move
+    #: Bit of statusword 6041h that the drive inverts whenever it refreshes its PDO. None where it
+    #: has no such bit: frozen data are then detected by values that do not change during a move
     #: (drivers/stream/watch.py).
     toggle_bit: int | None = None
     #: Torque actual value [per mille of the rated torque], None where the drive has none. It is
@@ -182,12 +194,12 @@ class DriveProfile:
     @property
     def signal(self) -> str:
         """Description of the recorded current: "current reference 6074h:00"."""
-        words = {
+        tap_names = {
             TapPoint.REFERENCE: "current reference",
             TapPoint.LIMITED_REFERENCE: "limited current reference",
             TapPoint.ACTUAL: "ACTUAL current",
         }
-        return f"{words[self.tap]} {self.current}"
+        return f"{tap_names[self.tap]} {self.current}"
 
 
 CIA402 = DriveProfile(
@@ -268,7 +280,7 @@ class ParameterKind(Enum):
         return int(self.value[1:])
 
 
-_CODES = {
+_STRUCT_CODES = {
     ParameterKind.I16: "<h",
     ParameterKind.U16: "<H",
     ParameterKind.I32: "<i",
@@ -290,26 +302,28 @@ class DriveParameter:
 
     @property
     def entry(self) -> ObjectEntry:
-        """The object as it goes over the bus: its bits as an unsigned word."""
+        """The object as SDO transfers it: its bit pattern as an unsigned number."""
         return ObjectEntry(self.index, self.subindex, self.kind.bits)
 
     def word(self, value: float) -> int:
-        """Return the bits of the nearest number that it can hold.
+        """Return the bit pattern of the nearest number that the object can hold.
 
         Raises:
             ValueError: the value is out of range, or not finite.
         """
         if not math.isfinite(value):
             raise ValueError(f"{value} is no number for {self}")
+        number = value
+        if self.kind is not ParameterKind.F32:
+            number = round(value)
         try:
-            data = struct.pack(
-                _CODES[self.kind], value if self.kind is ParameterKind.F32 else round(value)
-            )
+            data = struct.pack(_STRUCT_CODES[self.kind], number)
         except (struct.error, OverflowError) as error:
             raise ValueError(f"{value:g} does not fit {self.kind.value} {self}") from error
         return int.from_bytes(data, "little")
 
     def value(self, word: int) -> float:
         """Return the number of a bit pattern; REAL32 has NaN and infinity."""
-        (number,) = struct.unpack(_CODES[self.kind], word.to_bytes(self.kind.bits // 8, "little"))
+        data = word.to_bytes(self.kind.bits // 8, "little")
+        (number,) = struct.unpack(_STRUCT_CODES[self.kind], data)
         return float(number)

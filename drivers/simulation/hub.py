@@ -1,14 +1,14 @@
 """A small socketcand-protocol server: a CAN bus between processes of one machine,
 without any kernel driver.
 
-Every frame of one client goes to all other clients of its channel; one that no CAN bus carries is
-refused to its sender and reaches no client. The server listens on the loopback interface alone. A
-client that does not read is disconnected when ``BACKLOG_BYTES`` wait for it, so that no frame is
-lost silently: its next call fails.
+Every frame of one client goes to all other clients of its channel. A frame that no CAN bus carries
+is refused: its sender gets an error, and no client gets the frame. The server listens on the
+loopback interface alone. A client that does not read is disconnected when ``BACKLOG_BYTES`` wait
+for it, so that no frame is lost silently: its next call fails.
 
-The first client of a channel is the cell that the hub was started for, and is never disconnected.
-While it has more to read than ``FULL_BYTES``, the others are not read: they cannot send faster than
-it lives, as on a wire. Neither is a client that does not read the hub's own answers.
+The first client of a channel is the simulated cell, and is never disconnected. While more than
+``THROTTLE_BYTES`` wait for it, the server reads no other client: as on a wire, nobody sends faster
+than the cell receives. Nor does it read a client that leaves the server's own answers unread.
 """
 
 from __future__ import annotations
@@ -26,14 +26,23 @@ from drivers.errors import BusError
 
 HOST = "127.0.0.1"
 BACKLOG_BYTES = 8 << 20
-FULL_BYTES = 64 << 10  #: About 1500 frames, 50 ms of a simulated cell
-# Possessive: each byte is read a bounded number of times, so that no line takes long.
-_COMMAND = re.compile(rb"<\s*+(?:send ([0-9A-Fa-f]++) ([0-9A-Fa-f]++)([0-9A-Fa-f ]*+)|([^<>]*+))>")
+THROTTLE_BYTES = 64 << 10  #: About 1500 frames, 50 ms of a simulated cell
+# ``< send ID LENGTH DATA >`` as three groups, or any other command as the fourth. Possessive: each
+# byte is read a bounded number of times, so that no line takes long.
+_COMMAND = re.compile(
+    rb"<\s*+(?:"
+    rb"send ([0-9A-Fa-f]++) ([0-9A-Fa-f]++)([0-9A-Fa-f ]*+)"
+    rb"|([^<>]*+)"
+    rb")>"
+)
 _MAX_COMMAND_BYTES = 256
 #: Hexadecimal digits of an identifier of 11 and of 29 bits
 _BASE_DIGITS = 3
 _EXTENDED_DIGITS = 8
 _LONGEST_DATA = 8  #: Bytes of a CAN frame
+_LARGEST_BASE = 0x7FF
+_LARGEST_EXTENDED = 0x1FFF_FFFF
+_UNKNOWN_COMMAND = b"< error unknown command >"
 _REMEDIES = {
     errno.EADDRINUSE: ": another hub runs on this port; use that one, end it, or choose another "
     "port (0: a free one)",
@@ -99,14 +108,16 @@ class _Client(asyncio.Protocol):
     def __init__(self, hub: Hub) -> None:
         self._hub = hub
         self._channel: str | None = None
-        self._raw = False
+        self._in_raw_mode = False
         self._incoming = b""
-        self._full = False  # more waits for it than FULL_BYTES
-        self._answered = False  # some of that may be answers of the hub itself
+        # Whether more than THROTTLE_BYTES wait to be sent to it
+        self._send_buffer_full = False
+        # Whether answers of the server itself may be among them
+        self._answers_unread = False
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self._transport = cast(asyncio.Transport, transport)
-        self._transport.set_write_buffer_limits(high=FULL_BYTES)
+        self._transport.set_write_buffer_limits(high=THROTTLE_BYTES)
         self._hub.clients.add(self)
         self._write(b"< hi >")
 
@@ -128,13 +139,13 @@ class _Client(asyncio.Protocol):
         return self._channel is not None and self._hub.cells.get(self._channel) is self
 
     def pause_writing(self) -> None:
-        self._full = True
+        self._send_buffer_full = True
         self._throttle()
         if self._is_cell:
             self._throttle_others()
 
     def resume_writing(self) -> None:
-        self._full = False
+        self._send_buffer_full = False
         self._throttle()
         if self._is_cell:
             self._throttle_others()
@@ -145,34 +156,37 @@ class _Client(asyncio.Protocol):
                 other._throttle()
 
     def _throttle(self) -> None:
-        """Read this client only while there is room for what it sends."""
+        """Read this client only while there is room for its frames and for the answers to it."""
         cell = None
         if self._channel is not None:
             cell = self._hub.cells.get(self._channel)
-        waits_for_cell = cell is not None and cell is not self and cell._full
-        if waits_for_cell or (self._full and self._answered):
+        waits_for_cell = cell is not None and cell is not self and cell._send_buffer_full
+        leaves_answers = self._send_buffer_full and self._answers_unread
+        if waits_for_cell or leaves_answers:
             self._transport.pause_reading()
         else:
             self._transport.resume_reading()
 
     def _write(self, data: bytes) -> None:
         if self._transport.is_closing():
-            return  # asyncio would print a warning for each
+            # asyncio would print a warning for each.
+            return
         self._transport.write(data)
         if not self._is_cell and self._transport.get_write_buffer_size() > BACKLOG_BYTES:
             self.drop()
 
-    def _say(self, answers: list[bytes]) -> None:
-        """Write answers of the hub itself at once:
-        asyncio counts all that waits again with each write.
+    def _write_answers(self, answers: list[bytes]) -> None:
+        """Write answers of the server itself.
+
+        In one call: with each one asyncio adds up the sizes of all waiting writes.
         """
         if answers:
-            self._answered = True
+            self._answers_unread = True
             self._write(b"".join(answers))
 
     def data_received(self, data: bytes) -> None:
-        if not self._full:
-            self._answered = False
+        if not self._send_buffer_full:
+            self._answers_unread = False
         buffer = self._incoming + data
         end = 0
         frames = []
@@ -181,34 +195,36 @@ class _Client(asyncio.Protocol):
         for match in _COMMAND.finditer(buffer):
             end = match.end()
             identifier, length, payload, command = match.groups()
-            if command is not None or not self._raw:
+            if command is not None:
                 answers.append(self._answer_to(command))
-            elif len(match[0]) <= _MAX_COMMAND_BYTES and (
-                frame := _frame(identifier, int(length, 16), payload, stamp)
-            ):
+                continue
+            if not self._in_raw_mode:
+                answers.append(_UNKNOWN_COMMAND)
+                continue
+            frame = None
+            if len(match[0]) <= _MAX_COMMAND_BYTES:
+                frame = _frame(identifier, int(length, 16), payload, stamp)
+            if frame is not None:
                 frames.append(frame)
             else:
                 answers.append(b"< error malformed frame >")
-        self._say(answers)
+        self._write_answers(answers)
         self._incoming = buffer[end:]
         if len(self._incoming) > _MAX_COMMAND_BYTES:
-            self.drop()  # this is not the socketcand protocol
+            # This is not the socketcand protocol.
+            self.drop()
         if frames:
             burst = b"".join(frames)
             for other in tuple(self._hub.clients):
-                if other is not self and other._raw and other._channel == self._channel:
+                if other is not self and other._in_raw_mode and other._channel == self._channel:
                     other._write(burst)
         self._throttle()
 
-    def _answer_to(self, command: bytes | None) -> bytes:
-        """Do what a command says, and return the answer;
-        None is a frame that is sent before the raw mode.
-        """
-        words = b"send"
-        if command is not None:
-            words = command[:_MAX_COMMAND_BYTES]
-        word, _, argument = words.decode("ascii", "replace").strip().partition(" ")
-        if word == "open" and self._raw:
+    def _answer_to(self, command: bytes) -> bytes:
+        """Execute a command other than ``send``, and return the answer."""
+        text = command[:_MAX_COMMAND_BYTES].decode("ascii", "replace")
+        word, _, argument = text.strip().partition(" ")
+        if word == "open" and self._in_raw_mode:
             return b"< error a bus is open >"
         if word == "open" and argument in self._hub.channels:
             self._channel = argument
@@ -217,12 +233,12 @@ class _Client(asyncio.Protocol):
             known = ", ".join(self._hub.channels)
             return f"< error no bus {argument}, there is {known} >".encode("ascii", "replace")
         if word == "rawmode" and self._channel is not None:
-            self._raw = True
+            self._in_raw_mode = True
             self._hub.cells.setdefault(self._channel, self)
             return b"< ok >"
         if word == "echo":
             return b"< echo >"
-        return b"< error unknown command >"
+        return _UNKNOWN_COMMAND
 
 
 def _frame(identifier: bytes, length: int, payload: bytes, stamp: bytes) -> bytes | None:
@@ -236,7 +252,12 @@ def _frame(identifier: bytes, length: int, payload: bytes, stamp: bytes) -> byte
         stamp: seconds since 1970.
     """
     extended = len(identifier) > _BASE_DIGITS
-    if length > _LONGEST_DATA or (extended and len(identifier) != _EXTENDED_DIGITS):
+    largest = _LARGEST_BASE
+    if extended:
+        largest = _LARGEST_EXTENDED
+        if len(identifier) != _EXTENDED_DIGITS:
+            return None
+    if length > _LONGEST_DATA or int(identifier, 16) > largest:
         return None
     digits = payload.replace(b" ", b"")
     if len(digits) != 2 * length:
@@ -245,6 +266,5 @@ def _frame(identifier: bytes, length: int, payload: bytes, stamp: bytes) -> byte
         if len(tokens) != length or any(len(token) > 2 for token in tokens):
             return None
         digits = b"".join(token.rjust(2, b"0") for token in tokens)
-    if int(identifier, 16) > (0x1FFF_FFFF if extended else 0x7FF):
-        return None
-    return b"< frame %s %s %s >" % (identifier.upper().rjust(_BASE_DIGITS, b"0"), stamp, digits)
+    padded_identifier = identifier.upper().rjust(_BASE_DIGITS, b"0")
+    return b"< frame %s %s %s >" % (padded_identifier, stamp, digits)

@@ -26,12 +26,36 @@ from drivers.simulation.spec import AxisSpec, SdoAbort
 
 Send = Callable[[int, bytes], None]
 
+# SDO abort codes (CiA 301)
 NOT_STORED = 0x08000020
 NOT_IN_THIS_STATE = 0x08000022
-GAIN = 0x2003
+NO_DATA = 0x08000024
+# Objects by their index. CiA 301:
+SYNC_COB_ID = 0x1005
+ERROR_FIELD = 0x1003
 STORE = 0x1010
 LOAD_DEFAULTS = 0x1011
-QUICK_STOP = 3  #: Value of 6007h
+#: Node id in bits 16 to 22, time [ms] in bits 0 to 15
+CONSUMER_HEARTBEAT = 0x1016
+#: Period [ms]
+PRODUCER_HEARTBEAT = 0x1017
+IDENTITY = 0x1018
+# Of the manufacturer:
+GAIN = 0x2003
+# CiA 402:
+ABORT_CONNECTION_OPTION = 0x6007
+CONTROLWORD = (0x6040, 0)
+FOLLOWING_ERROR_WINDOW = 0x6065
+FOLLOWING_ERROR_TIMEOUT = 0x6066
+POSITION_WINDOW = 0x6067
+POSITION_WINDOW_TIME = 0x6068
+MAX_CURRENT = 0x6073
+#: Value of 6007h. The others: 0 no action, 1 fault, 2 disable voltage.
+QUICK_STOP = 3
+#: Transmission type of a PDO; higher ones are event-driven
+LAST_SYNCHRONOUS_TYPE = 240
+#: In 1005h
+PRODUCES_SYNC = 1 << 30
 
 
 class NmtState(IntEnum):
@@ -61,6 +85,11 @@ class Stored:
     pdos: tuple[PdoParameters, ...]
 
 
+def _is_pdo_mapping(index: int) -> bool:
+    """Whether the index of a PDO parameter is that of a mapping (1600h, 1A00h and on)."""
+    return bool(index & 0x200)
+
+
 class Node:
     """Node and its object dictionary; all methods are called from the cell's one thread."""
 
@@ -73,15 +102,17 @@ class Node:
         self._amplifiers = amplifiers
         self._send = send
         self._dictionary = amplifier_dictionary(axis)
-        self._signals = {
+        self._vendor_currents = {
             current.key: current.source(amplifiers, index) for current in vendor(axis).currents
         }
         self._values = {key: entry.default for key, entry in self._dictionary.items()}
-        self._receive, self._transmit = default_pdos(axis.node_id, self._dictionary, self._source)
+        self._rpdos, self._tpdos = default_pdos(axis.node_id, self._dictionary, self._source)
         self.saved = self._stored()  #: parameters that become valid with the next power-on
         self._defaults = self.saved
-        self._pending: dict[int, bytes] = {}
-        self._history: list[int] = []
+        # Data by PDO number, until the next SYNC
+        self._waiting_rpdos: dict[int, bytes] = {}
+        # Newest first
+        self._error_history: list[int] = []
         self._sdo = SdoServer(self.read, self.write)
         self._now_us = 0
         self._beat_us = 0
@@ -108,27 +139,30 @@ class Node:
             return
         if command == NmtCommand.START and self.nmt is not NmtState.OPERATIONAL:
             self.nmt = NmtState.OPERATIONAL
-            self._pending.clear()
-            for pdo in self._transmit:
+            self._waiting_rpdos.clear()
+            for pdo in self._tpdos:
                 pdo.reset()
             self.send_events()
         elif command == NmtCommand.STOP:
-            self._connection_lost()
+            self._abort_connection()
             self.nmt = NmtState.STOPPED
         elif command == NmtCommand.ENTER_PRE_OPERATIONAL:
             self.nmt = NmtState.PRE_OPERATIONAL
         elif command == NmtCommand.RESET_NODE:
             self.drive.reset()
             self._restore(self.saved, first=0x1000, last=0x9FFF)
-            self._history.clear()
+            self._error_history.clear()
             self.boot(wall_s)
         elif command == NmtCommand.RESET_COMMUNICATION:
-            self._connection_lost()
+            self._abort_connection()
             self._restore(self.saved, first=0x1000, last=0x1FFF)
             self.boot(wall_s)
 
     def receive(self, can_id: int, data: bytes, clock: Callable[[], float]) -> None:
-        """Take a frame of the bus that is no SYNC; most are for others."""
+        """Take a frame of the bus that is no SYNC; most are for others.
+
+        The upper four bits of an identifier are its service (CiA 301, predefined connection set).
+        """
         service = can_id & 0x780
         if can_id == 0:
             if len(data) >= 2 and data[1] in (0, self.node_id):
@@ -143,7 +177,8 @@ class Node:
 
     def hear_heartbeat(self, producer: int, wall_s: float) -> None:
         """Note a heartbeat; that of the node in 1016h is monitored from its first one on."""
-        if self._number(0x1016, 1) >> 16 & 0x7F == producer:
+        monitored_node = (self._number(CONSUMER_HEARTBEAT, 1) >> 16) & 0x7F
+        if producer == monitored_node:
             self._heard_wall_s = wall_s
 
     def excuse_silence(self, seconds: float) -> None:
@@ -158,39 +193,52 @@ class Node:
         """React by 6007h when the monitored heartbeat is overdue,
         and send the own one when it is due.
 
+        Args:
+            now_us: plant time [us]; it stands still while no SYNC comes.
+            wall_s: wall time [s].
+
         Returns:
             whether the monitored heartbeat has become overdue now.
         """
-        # Without SYNC plant time is stopped: the first is judged by wall time, the second by the
-        # faster of both.
-        allowed_ms = self._values[0x1016, 1] & 0xFFFF
-        heard_s = self._heard_wall_s
-        lost = False
-        if allowed_ms and heard_s is not None:
-            silent_ms = (wall_s - heard_s) * 1e3
-            lost = silent_ms >= allowed_ms
-        if lost or not allowed_ms:
-            self._heard_wall_s = None
+        lost = self._monitored_heartbeat_is_lost(wall_s)
         if lost:
             self.fall_back()
         self._now_us = now_us
-        period_ms = self._values[0x1017, 0]
+        self._send_heartbeat_if_due(wall_s)
+        return lost
+
+    def _monitored_heartbeat_is_lost(self, wall_s: float) -> bool:
+        """Whether the heartbeat of 1016h is overdue; then its monitoring ends.
+
+        By wall time: plant time stands still where the master has died.
+        """
+        allowed_ms = self._number(CONSUMER_HEARTBEAT, 1) & 0xFFFF
+        lost = False
+        if allowed_ms and self._heard_wall_s is not None:
+            silent_ms = (wall_s - self._heard_wall_s) * 1e3
+            lost = silent_ms >= allowed_ms
+        if lost or not allowed_ms:
+            self._heard_wall_s = None
+        return lost
+
+    def _send_heartbeat_if_due(self, wall_s: float) -> None:
+        """Send the heartbeat after the period of 1017h by plant time or wall time, the faster."""
+        period_ms = self._number(PRODUCER_HEARTBEAT)
         if period_ms == 0 or self.nmt is NmtState.INITIALISING:
-            return lost
-        since_us = now_us - self._beat_us
+            return
+        since_us = self._now_us - self._beat_us
         since_wall_ms = (wall_s - self._beat_wall_s) * 1e3
         if since_us >= 1000 * period_ms or since_wall_ms >= period_ms:
-            self._beat_us = now_us
+            self._beat_us = self._now_us
             self._beat_wall_s = wall_s
             self._send(0x700 + self.node_id, bytes([self.nmt]))
-        return lost
 
     def fall_back(self) -> None:
         """React to a heartbeat error: EMCY, the reaction of 6007h,
         and PRE-OPERATIONAL (the default of 1029h).
         """
         self._emergency(ErrorCode.HEARTBEAT_LOST)
-        self._connection_lost()
+        self._abort_connection()
         self.nmt = NmtState.PRE_OPERATIONAL
 
     def fail(self, code: int) -> None:
@@ -204,16 +252,17 @@ class Node:
             case FaultKind.REFUSES_NMT:
                 self._obeys_nmt = False
             case FaultKind.OTHER_SERIAL:
-                self._values[0x1018, 4] += 1
+                self._values[IDENTITY, 4] += 1
             case FaultKind.REFUSES_MAPPING:
-                for pdo in self._transmit:
+                for pdo in self._tpdos:
                     pdo.locked = True
             case FaultKind.SYNC_PRODUCER:
-                self._values[0x1005, 0] |= 1 << 30  # the cell sends the SYNC
+                # The cell sends the SYNC.
+                self._values[SYNC_COB_ID, 0] |= PRODUCES_SYNC
             case FaultKind.NO_GUARD:
                 for subindex in range(2):
-                    # Its value stays zero: no heartbeat is monitored
-                    del self._dictionary[0x1016, subindex]
+                    # Its value stays zero: no heartbeat is monitored.
+                    del self._dictionary[CONSUMER_HEARTBEAT, subindex]
             case FaultKind.REFUSES_WRITE:
                 self._refused.add(GAIN)
             case FaultKind.REFUSES_SAVE:
@@ -237,23 +286,24 @@ class Node:
         """Accept a receive PDO of this node: at once if event-driven, else with the next SYNC."""
         if self.nmt is not NmtState.OPERATIONAL:
             return
-        for number, pdo in enumerate(self._receive):
-            if pdo.valid and pdo.can_id == can_id:
-                if len(data) < pdo.layout.size:
-                    self._emergency(ErrorCode.PDO_TOO_SHORT)
-                elif pdo.parameters.transmission <= 240:
-                    self._pending[number] = data
-                else:
-                    self._unpack(pdo, data)
-                    self.send_events()
+        for number, pdo in enumerate(self._rpdos):
+            if not pdo.valid or pdo.can_id != can_id:
+                continue
+            if len(data) < pdo.layout.size:
+                self._emergency(ErrorCode.PDO_TOO_SHORT)
+            elif pdo.parameters.transmission <= LAST_SYNCHRONOUS_TYPE:
+                self._waiting_rpdos[number] = data
+            else:
+                self._unpack(pdo, data)
+                self.send_events()
 
     def begin_cycle(self) -> None:
         """Apply the synchronous receive PDOs on SYNC."""
-        if self._pending:
-            pending = self._pending
-            self._pending = {}
-            for number, data in pending.items():
-                self._unpack(self._receive[number], data)
+        if self._waiting_rpdos:
+            waiting = self._waiting_rpdos
+            self._waiting_rpdos = {}
+            for number, data in waiting.items():
+                self._unpack(self._rpdos[number], data)
 
     def end_cycle(self) -> None:
         """Update faults, waiting set-points and the toggle bit after the plant has moved."""
@@ -272,13 +322,15 @@ class Node:
         self._transmit_pdos(Pdo.on_event)
 
     def _transmit_pdos(self, due: Callable[[Pdo, int], bytes | None]) -> None:
-        if self.nmt is NmtState.OPERATIONAL:
-            for pdo in self._transmit:
-                data = None
-                if pdo.valid:
-                    data = due(pdo, self._now_us)
-                if data is not None:
-                    self._send(pdo.can_id, data)
+        """Send the valid transmit PDOs for which `due` returns data."""
+        if self.nmt is not NmtState.OPERATIONAL:
+            return
+        for pdo in self._tpdos:
+            data = None
+            if pdo.valid:
+                data = due(pdo, self._now_us)
+            if data is not None:
+                self._send(pdo.can_id, data)
 
     def request(self, data: bytes) -> None:
         """Answer an SDO request; a stopped node is silent."""
@@ -296,15 +348,16 @@ class Node:
         """
         pdo = self._pdo(index)
         if pdo is not None:
-            if index & 0x200:
+            if _is_pdo_mapping(index):
                 return pdo.read_mapping(subindex)
             return pdo.read_communication(subindex)
         entry = find(self._dictionary, index, subindex)
-        if (index, subindex) == (0x1003, 1) and not self._history:
-            raise SdoAbort(0x08000024)  # no data available
+        if (index, subindex) == (ERROR_FIELD, 1) and not self._error_history:
+            raise SdoAbort(NO_DATA)
         if entry.kind is Kind.TEXT:
             return entry.text.encode("ascii")
-        return entry.kind.encode(self._source((index, subindex))())
+        read_value = self._source((index, subindex))
+        return entry.kind.encode(read_value())
 
     def write(self, index: int, subindex: int, data: bytes) -> None:
         """Write an entry.
@@ -314,7 +367,7 @@ class Node:
         """
         pdo = self._pdo(index)
         if pdo is not None:
-            if index & 0x200:
+            if _is_pdo_mapping(index):
                 pdo.write_mapping(subindex, data)
             else:
                 pdo.write_communication(subindex, data)
@@ -326,30 +379,38 @@ class Node:
         # Drives write their memory with the power stage off.
         if index in self._refused or (index == STORE and self.drive.powered):
             raise SdoAbort(NOT_IN_THIS_STATE)
-        if index in (STORE, LOAD_DEFAULTS):
-            if value != (SAVE if index == STORE else LOAD):
+        if index == STORE:
+            if value != SAVE:
+                raise SdoAbort(NOT_STORED)
+            self.saved = self._stored()
+        elif index == LOAD_DEFAULTS:
+            if value != LOAD:
                 raise SdoAbort(NOT_STORED)
             # Restored parameters become valid with the next reset (CiA 301 §7.5.2.14).
             self.saved = self._defaults
-            if index == STORE:
-                self.saved = self._stored()
-        elif index == 0x1003:
-            self._history.clear()
+        elif index == ERROR_FIELD:
+            self._error_history.clear()
         else:
             self._set((index, subindex), value)
 
     def _pdo(self, index: int) -> Pdo | None:
+        """Return the PDO to which an index belongs; None for all other objects.
+
+        CiA 301: RPDOs have 1400h to 17FFh, TPDOs 1800h to 1BFFh, 512 communication parameters and
+        512 mappings each.
+        """
         if not 0x1400 <= index <= 0x1BFF:
             return None
-        side = self._receive
+        pdos = self._rpdos
         if index >= 0x1800:
-            side = self._transmit
+            pdos = self._tpdos
         number = index & 0x1FF
-        if number >= len(side):
+        if number >= len(pdos):
             raise SdoAbort(NO_OBJECT)
-        return side[number]
+        return pdos[number]
 
     def _source(self, key: tuple[int, int]) -> Callable[[], int]:
+        """Return a function that reads the present value of an entry, by index and subindex."""
         i = self._index
         drive = self.drive
         amplifiers = self._amplifiers
@@ -368,53 +429,65 @@ class Node:
             0x60F4: lambda: amplifiers.readings.demand[i] - amplifiers.readings.position[i],
         }
         index, subindex = key
-        if index == 0x1003 and subindex:
+        if index == ERROR_FIELD and subindex:
             return self._last_error
-        if index == 0x1003:
-            return lambda: len(self._history[:1])
-        return self._signals.get(key) or live.get(index, lambda: self._number(index, subindex))
+        if index == ERROR_FIELD:
+            # Of all errors it reports the last one only.
+            return lambda: len(self._error_history[:1])
+        if key in self._vendor_currents:
+            return self._vendor_currents[key]
+        return live.get(index, lambda: self._number(index, subindex))
 
     def _last_error(self) -> int:
         """Return object 1003h:01."""
-        if self._history:
-            return self._history[0]
+        if self._error_history:
+            return self._error_history[0]
         return 0
 
     def _number(self, index: int, subindex: int = 0) -> int:
+        """Return the last value that was written to an entry, or its default."""
         return self._values[index, subindex]
 
     def _unpack(self, pdo: Pdo, data: bytes) -> None:
-        """Set the values of a receive PDO;
-        a controlword last, so that it acts on its companions.
+        """Set the values of a receive PDO.
+
+        A controlword comes last, so that it acts on the set-points in the same PDO.
         """
         values = dict(zip(pdo.mapped, pdo.layout.unpack_from(data), strict=True))
-        for key in sorted(values, key=lambda key: key == (0x6040, 0)):
+        for key in sorted(values, key=lambda key: key == CONTROLWORD):
             if self._dictionary[key].accepts(values[key]):
                 self._set(key, values[key])
 
     def _set(self, key: tuple[int, int], value: int) -> None:
+        """Set the value of an entry, and act on it."""
         self._values[key] = value
-        if key == (0x6040, 0):
-            fault = self.drive.error
+        index, _ = key
+        if key == CONTROLWORD:
+            error_before = self.drive.error
             self.drive.command(value)
-            if fault is not ErrorCode.NONE and self.drive.error is ErrorCode.NONE:
-                self._send(0x80 + self.node_id, struct.pack("<HB5x", ErrorCode.NONE, 0))
-        elif 0x6065 <= key[0] <= 0x6073:
+            had_error = error_before is not ErrorCode.NONE
+            if had_error and self.drive.error is ErrorCode.NONE:
+                # EMCY 0000h (CiA 301): error reset
+                emcy = struct.pack("<HB5x", ErrorCode.NONE, 0)
+                self._send(0x80 + self.node_id, emcy)
+        elif FOLLOWING_ERROR_WINDOW <= index <= MAX_CURRENT:
             self._apply_settings()
 
     def _apply_settings(self) -> None:
+        """Pass windows, times and current limit to the control loop."""
         loop = self._amplifiers.loops[self._index]
-        loop["error_window"] = self._number(0x6065)
-        loop["error_time_s"] = self._number(0x6066) * 1e-3
-        loop["target_window"] = self._number(0x6067)
-        loop["target_time_s"] = self._number(0x6068) * 1e-3
+        loop["error_window"] = self._number(FOLLOWING_ERROR_WINDOW)
+        loop["error_time_s"] = self._number(FOLLOWING_ERROR_TIMEOUT) * 1e-3
+        loop["target_window"] = self._number(POSITION_WINDOW)
+        loop["target_time_s"] = self._number(POSITION_WINDOW_TIME) * 1e-3
         # An amplifier without 6073h keeps its peak current.
-        if (0x6073, 0) in self._dictionary:
-            loop["limit_a"] = self._number(0x6073) * 1e-3 * self._axis.rated_current_a
+        if (MAX_CURRENT, 0) in self._dictionary:
+            per_mille = self._number(MAX_CURRENT)
+            loop["limit_a"] = per_mille * 1e-3 * self._axis.rated_current_a
 
-    def _connection_lost(self) -> None:
+    def _abort_connection(self) -> None:
         """React by the abort connection option code 6007h."""
-        option = self._number(0x6007)
+        option = self._number(ABORT_CONNECTION_OPTION)
         if option == 0 or (not self.drive.powered and option < QUICK_STOP):
             return
         if option == 1:
@@ -426,20 +499,21 @@ class Node:
             self.drive.quick_stop()
 
     def _emergency(self, code: int) -> None:
-        self._history.insert(0, int(code))
+        self._error_history.insert(0, int(code))
         if self.nmt in (NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL):
             register = int(self.drive.error is not ErrorCode.NONE)
-            self._send(0x80 + self.node_id, struct.pack("<HB5x", code, register))
+            emcy = struct.pack("<HB5x", code, register)
+            self._send(0x80 + self.node_id, emcy)
 
     def _stored(self) -> Stored:
         return Stored(
-            dict(self._values), tuple(pdo.parameters for pdo in self._receive + self._transmit)
+            dict(self._values), tuple(pdo.parameters for pdo in self._rpdos + self._tpdos)
         )
 
     def _restore(self, stored: Stored, first: int, last: int) -> None:
         for key, value in stored.values.items():
             if first <= key[0] <= last:
                 self._values[key] = value
-        for pdo, parameters in zip(self._receive + self._transmit, stored.pdos, strict=True):
+        for pdo, parameters in zip(self._rpdos + self._tpdos, stored.pdos, strict=True):
             pdo.restore(parameters)
-        self._pending.clear()
+        self._waiting_rpdos.clear()

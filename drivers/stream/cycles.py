@@ -20,12 +20,12 @@ from drivers.messages import CellEvent, EventKind, EventSink
 
 #: Largest delay of the reader behind the bus; older data cannot protect moving axes
 LARGEST_LAG_NS = 1_000_000_000
-#: Frames between two looks at the clock while frames are waiting: each is a system call
-LOOK_EVERY = 64
+#: Frames that are read in a row without the clock: to read it is a system call
+FRAMES_PER_CLOCK_CHECK = 64
 
 
 def nothing_to_send(_: int) -> Sequence[can.Message]:
-    """Return no frames: see `CycleBus.spare`."""
+    """Return no frames: see `CycleBus.low_priority`."""
     return ()
 
 
@@ -35,8 +35,9 @@ def is_sync(message: can.Message) -> bool:
 
 
 def arrived_ns(message: can.Message, now_ns: int) -> int:
-    """Return the monotonic time at which a frame arrived [ns]:
-    the kernel's, or the present one without its stamp.
+    """Return the monotonic time at which a frame arrived [ns].
+
+    It is the kernel's stamp, or `now_ns` for a frame without one.
     """
     if isinstance(message, CapturedMessage):
         return message.monotonic_ns
@@ -52,8 +53,8 @@ class CycleBus:
         clock: monotonic [ns].
         start_ns: time of the first SYNC in the samples [ns since 1970].
         emit: receives events.
-        between: processes a frame that is read before the next SYNC, and so answers none that is
-            open.
+        process_between: processes a frame that is read after a cycle has ended and before the
+            next SYNC.
     """
 
     def __init__(
@@ -62,35 +63,39 @@ class CycleBus:
         clock: Clock,
         start_ns: int,
         emit: EventSink,
-        between: Callable[[can.Message], None],
+        process_between: Callable[[can.Message], None],
     ) -> None:
         self.link = link
         self.clock = clock
-        #: What must stop a recording and was not raised yet, the oldest first.
+        #: Errors that must stop a recording and were not raised yet, the oldest first
         self.faults: deque[DriverError] = deque()
         self.emit = emit
-        self.between = between
-        self.cycles = 0  #: SYNCs sent, or followed
-        self.skipped = 0  #: Periods without a SYNC
+        self.process_between = process_between
+        #: SYNCs sent, or followed
+        self.cycles = 0
+        #: Periods without a SYNC
+        self.skipped = 0
         #: Time of the last SYNC in the samples [ns since 1970]; the start before the first one
         self.time_ns = start_ns
-        self.answered_ns = 0  #: Time of the last answer by the clock [ns], or of the first SYNC
-        self.silent = False  #: Whether no axis answered the last SYNC
+        #: Time of the last answer by the clock [ns], or of the first SYNC
+        self.answered_ns = 0
+        #: Whether no axis answered the last SYNC
+        self.silent = False
         #: Frames to send right before the next SYNC, which triggers synchronous RPDOs.
         self.outgoing: list[can.Message] = []
-        #: Returns frames that may wait, for a cycle that has no others to send; receives the last
-        #: SYNC's time [ns].
-        self.spare: Callable[[int], Sequence[can.Message]] = nothing_to_send
+        #: Returns frames that are sent only where `outgoing` is empty; takes the last SYNC's time
+        #: [ns since 1970].
+        self.low_priority: Callable[[int], Sequence[can.Message]] = nothing_to_send
         self._start_ns = start_ns
         self._first_sync_ns = 0
         self._sync = base_frame(SYNC_COB_ID)
-        self._take_batched: Callable[[], can.Message | None] | None = None
-        self._unlooked = 0
+        self._take_received: Callable[[], can.Message | None] | None = None
+        self._frames_since_clock = 0
         self._reported_late = False
 
     def begin(self) -> None:
-        """Find how the open bus is read."""
-        self._take_batched = getattr(self.link.bus, "take", None)
+        """Find out whether the open bus reads in bursts (`BurstBus.take`)."""
+        self._take_received = getattr(self.link.bus, "take", None)
 
     def report(self, axis: int | None, kind: EventKind, code: int, text: str) -> None:
         """Emit an event of an axis, or of the whole cell, at the time of the last SYNC."""
@@ -102,32 +107,36 @@ class CycleBus:
             self._first_sync_ns = at_ns
         self.time_ns = self._start_ns + at_ns - self._first_sync_ns
 
-    def waiting(self) -> Iterator[can.Message]:
+    def arrived_frames(self) -> Iterator[can.Message]:
         """Yield the frames that have arrived already; a reader that needs too long is a fault."""
         recv = self.link.bus.recv
         begun_ns = self.clock()
         while (message := recv(0.0)) is not None:
             yield message
-            if self.too_late(self.clock() - begun_ns):
+            if self.check_lag(self.clock() - begun_ns):
                 return
 
     def read_waiting(self) -> None:
         """Process the frames that have arrived already: the next SYNC comes after them."""
-        for message in self.waiting():
-            self.between(message)
+        for message in self.arrived_frames():
+            self.process_between(message)
 
-    def batched(self) -> can.Message | None:
-        """Return a frame that was received with the one before, without a look at the clock;
-        now and then None.
+    def next_of_burst(self) -> can.Message | None:
+        """Return a frame that the bus has received already.
+
+        None where there is none, and for every `FRAMES_PER_CLOCK_CHECK`-th call: the caller then
+        reads the clock, and sends SYNC and heartbeat if they are due.
         """
-        self._unlooked = (self._unlooked + 1) % LOOK_EVERY
-        if self._take_batched is None or self._unlooked == 0:
+        self._frames_since_clock = (self._frames_since_clock + 1) % FRAMES_PER_CLOCK_CHECK
+        if self._take_received is None or self._frames_since_clock == 0:
             return None
-        return self._take_batched()
+        return self._take_received()
 
-    def too_late(self, behind_ns: int) -> bool:
-        """Return whether the reader is too late;
-        reported once, because the counters show whether frames were lost.
+    def check_lag(self, behind_ns: int) -> bool:
+        """Return whether the reader is more than `LARGEST_LAG_NS` late.
+
+        The first time adds a fault. It is added once, because the counters show whether frames
+        were lost.
         """
         late = behind_ns > LARGEST_LAG_NS
         if late and not self._reported_late:
@@ -138,10 +147,12 @@ class CycleBus:
         return late
 
     def take_outgoing(self) -> Sequence[can.Message]:
-        """Return the frames to send now, and forget them."""
+        """Return the frames to send now, and remove them from `outgoing`."""
         outgoing = self.outgoing
         self.outgoing = []
-        return outgoing or self.spare(self.time_ns)
+        if outgoing:
+            return outgoing
+        return self.low_priority(self.time_ns)
 
     def send_sync(self) -> None:
         """Send the frames that wait, and the SYNC right after them."""
@@ -157,16 +168,21 @@ class Cycles(ABC):
         self.early_sync: can.Message | None = None
 
     def begin(self) -> Cycles:
-        """Discard the frames from before the first SYNC;
-        returns the cycles that fit the open bus.
+        """Discard the frames from before the first SYNC.
+
+        Returns:
+            the cycles to use: these, or others that fit the open bus better.
         """
         self.bus.read_waiting()
         return self
 
     @abstractmethod
     def open(self) -> Cycles | None:
-        """Begin a cycle with its SYNC; where that SYNC comes no more,
-        return the cycles that begin it instead.
+        """Begin a cycle with its SYNC.
+
+        Returns:
+            None once the cycle is begun; where no SYNC comes any more, other cycles, whose `open`
+            must be called instead.
         """
 
     @abstractmethod

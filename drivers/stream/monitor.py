@@ -8,14 +8,14 @@ a node; then a sample has the last values of all axes, every READING_S. Nothing 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import Enum
 
 import can
 
 from drivers.canopen.bus import bus_errors, is_plain
-from drivers.canopen.link import SYNC_COB_ID, Link
+from drivers.canopen.link import NMT_COB_ID, SYNC_COB_ID, Link
 from drivers.canopen.pdo import feedback_entries
 from drivers.canopen.sdo import SDO_ANSWER, SDO_REQUEST, upload_answer, upload_request
 from drivers.canopen.split_bus import FROM_NODES, SplitAddress
@@ -27,7 +27,8 @@ from drivers.stream.answers import slots_of
 QUIET_S = 2.0  #: Silence of other masters after which the axes are read by SDO
 #: Time allowed for an answer; CiA 301 sets no limit, and drives answer within milliseconds
 ANSWER_S = 0.3
-ABANDONED_S = 1.0  #: A request without an answer for so long is lost, and the axis is asked anew
+#: A request without an answer for so long is lost, and the objects are read from the first again
+ABANDONED_S = 1.0
 #: Time between two SDO readings of an axis: six axes then load a bus of 1 Mbit/s by some 5 %
 READING_S = 0.1
 
@@ -88,24 +89,32 @@ class CellReading:
 
 
 class _AxisWatch:
-    """Last values of one axis, and its pending answers."""
+    """Last values of one axis, and its pending answers.
+
+    A reading has one value of each of `entries`. A column is an index of `entries`.
+    """
 
     def __init__(self, axis: Axis) -> None:
         self.node_id = axis.node_id
         self.entries = feedback_entries(axis)
-        self.slots = slots_of((axis,))  # of one axis alone: columns are indices of its entries
+        self.slots = slots_of((axis,))  # by COB-ID
         self.values: list[int | None] = [None] * len(self.entries)
-        self.seen: set[int] = set()
-        self.followed = False
-        self.readings = 0
+        self.answered: set[int] = set()  # COB-IDs of the answers to the last SYNC
+        self.has_answered = False  # whether an earlier SYNC was answered completely
+        self.readings = 0  # complete ones since the last `take`
         self.lost = 0
         self.complete_ns: int | None = None  # when the last complete reading by SDO came
-        self.asked = -1
-        self.asked_ns: int | None = None  # when the request that waits for its answer was sent
-        self.due_ns = 0
+        self.requested = -1  # column of the last request, -1 before the first of a reading
+        self.request_ns: int | None = None  # when the open request was sent
+        self.next_reading_ns = 0
         self.heard_ns: int | None = None
-        self.delay_ns: int | None = None
+        self.longest_delay_ns: int | None = None
         self.refused: dict[int, ObjectRefusal] = {}  # by column
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether the last SYNC has all its answers."""
+        return self.answered == self.slots.keys()
 
     def take(self, nmt: int | None, since_ns: int, now_ns: int) -> AxisReading:
         """Return a reading and begin the next."""
@@ -113,6 +122,9 @@ class _AxisWatch:
         lasted_s = max((now_ns - since_ns) * 1e-9, 1e-9)
         abandoned_ns = min(since_ns, now_ns - round(ABANDONED_S * 1e9))
         refused = [self.refused[column] for column in sorted(self.refused)]
+        delay_s = None
+        if self.longest_delay_ns is not None:
+            delay_s = self.longest_delay_ns * 1e-9
         reading = AxisReading(
             position_counts=position,
             current_raw=current,
@@ -121,66 +133,79 @@ class _AxisWatch:
             rate_hz=self.readings / lasted_s,
             lost=self.lost,
             heard=self.heard_ns is not None and self.heard_ns >= abandoned_ns,
-            delay_s=None if self.delay_ns is None else self.delay_ns * 1e-9,
+            delay_s=delay_s,
             refused=tuple(refused),
         )
         self.readings = 0
-        self.delay_ns = None
+        self.longest_delay_ns = None
         return reading
 
-    def hear(self, cob_id: int, data: bytes) -> None:
+    def hear_pdo(self, cob_id: int, data: bytes) -> None:
+        """Take an overheard TPDO."""
         slot = self.slots[cob_id]
         if len(data) != slot.length:
-            return  # another master's mapping: not ours to interpret
+            # Another master's mapping: not ours to interpret.
+            return
         for column, value in zip(slot.columns, slot.layout.unpack(data), strict=True):
             self.values[column] = value
             self.refused.pop(column, None)
-        self.seen.add(cob_id)
-        self.readings += self.seen == self.slots.keys()
+        self.answered.add(cob_id)
+        if self.is_complete:
+            self.readings += 1
 
-    def sync(self) -> None:
-        """End the time for answers to the SYNC before;
-        losses count from an axis's first complete answer on.
+    def hear_sync(self) -> None:
+        """End the time for answers to the SYNC before.
+
+        Missing answers count as lost from the first complete answer of the axis on.
         """
-        self.lost += self.followed and self.seen != self.slots.keys()
-        self.followed = self.followed or self.seen == self.slots.keys()
-        self.seen.clear()
+        if self.is_complete:
+            self.has_answered = True
+        elif self.has_answered:
+            self.lost += 1
+        self.answered.clear()
 
-    def answer(self, data: bytes, now_ns: int) -> None:
-        """Take an answer to the open request, however late it comes."""
-        answer = upload_answer(data, self.entries[self.asked])
-        if self.asked_ns is None or answer is None:
-            return  # an answer to another program
-        self.delay_ns = max(self.delay_ns or 0, now_ns - self.asked_ns)
-        self.asked_ns = None
-        self.values[self.asked] = answer.value
+    def hear_answer(self, data: bytes, now_ns: int) -> None:
+        """Take an SDO answer to the open request, however late it comes."""
+        column = self.requested
+        entry = self.entries[column]
+        answer = upload_answer(data, entry)
+        if self.request_ns is None or answer is None:
+            # An answer to another program
+            return
+        delay_ns = now_ns - self.request_ns
+        self.longest_delay_ns = max(self.longest_delay_ns or 0, delay_ns)
+        self.request_ns = None
+        self.values[column] = answer.value
         if answer.value is None:
-            self.refused[self.asked] = ObjectRefusal(self.entries[self.asked], answer.abort_code)
+            self.refused[column] = ObjectRefusal(entry, answer.abort_code)
         else:
-            self.refused.pop(self.asked, None)
-        if self.asked == len(self.entries) - 1 and not self.refused:
+            self.refused.pop(column, None)
+        is_last = column == len(self.entries) - 1
+        if is_last and not self.refused:
             self.readings += 1
             self.complete_ns = now_ns
 
     def next_request(self, now_ns: int) -> ObjectEntry | None:
-        if self.asked_ns is not None:
-            if now_ns < self.asked_ns + round(ABANDONED_S * 1e9):
+        """Return the object to request now; None while an answer or a reading is awaited."""
+        if self.request_ns is not None:
+            if now_ns < self.request_ns + round(ABANDONED_S * 1e9):
                 return None
             self.lost += 1
-            self.drop()  # start again: the values of a reading belong together
-        following = (self.asked + 1) % len(self.entries)
-        if following == 0:
-            if now_ns < self.due_ns:
+            # From the first object again: the values of a reading belong together.
+            self.abandon_request()
+        column = (self.requested + 1) % len(self.entries)
+        if column == 0:
+            if now_ns < self.next_reading_ns:
                 return None
-            self.due_ns = now_ns + round(READING_S * 1e9)
-        self.asked = following
-        self.asked_ns = now_ns
-        return self.entries[self.asked]
+            self.next_reading_ns = now_ns + round(READING_S * 1e9)
+        self.requested = column
+        self.request_ns = now_ns
+        return self.entries[column]
 
-    def drop(self) -> None:
-        """Wait for no answer any more."""
-        self.asked_ns = None
-        self.asked = -1
+    def abandon_request(self) -> None:
+        """Wait for no answer any more, and begin with the first object again."""
+        self.request_ns = None
+        self.requested = -1
 
 
 class CellMonitor:
@@ -215,23 +240,27 @@ class CellMonitor:
         """
         self._link = link
         self._on_sample = on_sample
-        self._offset_ns = wall_minus_monotonic_ns
+        self._wall_minus_monotonic_ns = wall_minus_monotonic_ns
         self._taken = taken
         self._axes = tuple(_AxisWatch(axis) for axis in axes)
         self._by_cob_id: dict[int, _AxisWatch] = {}
         for axis_watch in self._axes:
             self._by_cob_id |= dict.fromkeys(axis_watch.slots, axis_watch)
         self._by_node = {axis.node_id: axis for axis in self._axes}
-        self._split = link.address if isinstance(link.address, SplitAddress) else None
-        self._buses = ("",) if self._split is None else tuple(map(str, self._split.parts))
-        self._frames: Counter[tuple[int, int]] = Counter()
+        self._split: SplitAddress | None = None
+        self._buses: tuple[str, ...] = ("",)
+        if isinstance(link.address, SplitAddress):
+            self._split = link.address
+            self._buses = tuple(map(str, self._split.parts))
+        self._frames: Counter[tuple[int, int]] = Counter()  # by bus and length
         self._syncs = 0
         self._cycle = 0
-        # Clock and stamp of the last SYNC, until its sample is complete
-        self._sync: tuple[int, float] | None = None
-        self._sample_due_ns = 0
-        self._master_ns: int | None = None
-        self._began_ns = self._since_ns = link.clock()
+        # Clock [ns] and stamp [s] of the last SYNC, until its sample is complete
+        self._last_sync: tuple[int, float] | None = None
+        self._next_sample_ns = 0
+        self._began_ns = link.clock()
+        self._master_ns: int | None = None  # when another master was last heard
+        self._since_ns = self._began_ns  # the last reading
 
     @property
     def source(self) -> ReadingSource:
@@ -251,7 +280,7 @@ class CellMonitor:
         with bus_errors(self._link.address):
             while (left_ns := deadline_ns - clock()) > 0:
                 if self.source is ReadingSource.ASKED:
-                    self._ask()
+                    self._send_requests()
                     self._sample_asked(clock())
                 message = self._link.bus.recv(min(left_ns * 1e-9, READING_S / 10))
                 if message is not None:
@@ -270,79 +299,93 @@ class CellMonitor:
         sync_hz = self._syncs / lasted_s
         self._syncs = 0
         self._frames.clear()
-        events = self._link.take_events(now_ns + self._offset_ns, tuple(self._by_node))
+        wall_ns = now_ns + self._wall_minus_monotonic_ns
+        events = self._link.take_events(wall_ns, tuple(self._by_node))
         return CellReading(self.source, lasted_s, tuple(axes), sync_hz, tuple(frames), events)
 
     def pause(self) -> None:
         """Drop open requests: other code reads the bus for a moment."""
         for axis in self._axes:
-            axis.drop()
+            axis.abandon_request()
 
-    def _ask(self) -> None:
+    def _send_requests(self) -> None:
+        """Send the requests that are due, one an axis, unless a recorder has taken the bus."""
         now_ns = self._link.clock()
-        due = [
-            (axis, entry) for axis in self._axes if (entry := axis.next_request(now_ns)) is not None
-        ]
-        if due and self._taken():
-            self._lead()
+        requests = []
+        for axis in self._axes:
+            entry = axis.next_request(now_ns)
+            if entry is not None:
+                requests.append(upload_request(axis.node_id, entry))
+        if requests and self._taken():
+            self._note_master()
             return
-        for axis, entry in due:
-            request = upload_request(axis.node_id, entry)
+        for request in requests:
             self._link.send((request,))
-            for bus in (0,) if self._split is None else self._split.route(request):
+            buses: Sequence[int] = (0,)
+            if self._split is not None:
+                buses = self._split.route(request)
+            for bus in buses:
                 self._frames[bus, len(request.data)] += 1
 
     def _hear(self, message: can.Message) -> None:
-        bus = 0 if self._split is None else self._buses.index(str(message.channel))
+        bus = 0
+        if self._split is not None:
+            bus = self._buses.index(str(message.channel))
         self._frames[bus, len(message.data)] += 1
         if not is_plain(message):
             self._link.dispatch(message)
             return
         identifier = message.arbitration_id
+        data = bytes(message.data)
         axis = self._by_node.get(identifier & 0x7F)
         if axis is not None and identifier & ~0x7F in FROM_NODES:
             axis.heard_ns = self._link.clock()
+        answering = self._by_node.get(identifier - SDO_ANSWER)
+        is_sdo_request = SDO_REQUEST <= identifier < SDO_REQUEST + 0x80
         if identifier == SYNC_COB_ID:
             self._syncs += 1
-            self._lead()
+            self._note_master()
             self._sample_overheard(message.timestamp)
             for axis in self._axes:
-                axis.sync()
-        elif identifier == 0 or SDO_REQUEST <= identifier < SDO_REQUEST + 0x80:
-            self._lead()
+                axis.hear_sync()
+        elif identifier == NMT_COB_ID or is_sdo_request:
+            self._note_master()
         elif identifier in self._by_cob_id:
-            self._by_cob_id[identifier].hear(identifier, bytes(message.data))
-        elif identifier - SDO_ANSWER in self._by_node and len(message.data) == 8:
-            self._by_node[identifier - SDO_ANSWER].answer(bytes(message.data), self._link.clock())
+            self._by_cob_id[identifier].hear_pdo(identifier, data)
+        elif answering is not None and len(data) == 8:
+            answering.hear_answer(data, self._link.clock())
         else:
             self._link.dispatch(message)
 
-    def _lead(self) -> None:
-        """Note that there is another master."""
+    def _note_master(self) -> None:
+        """Note that another master uses the bus, or is about to."""
         if self.source is ReadingSource.ASKED:
             self.pause()
             for axis in self._axes:
-                axis.followed = False
-                axis.seen.clear()
+                axis.has_answered = False
+                axis.answered.clear()
         self._master_ns = self._link.clock()
 
     def _sample_overheard(self, stamp_s: float) -> None:
         """Complete the sample of the SYNC before this one, which has the given time stamp."""
-        before = self._sync
-        self._sync = (self._link.clock(), stamp_s)
-        if before is None:
+        last_sync = self._last_sync
+        self._last_sync = (self._link.clock(), stamp_s)
+        if last_sync is None:
             return
-        self._emit(before[0], [axis.seen != axis.slots.keys() for axis in self._axes])
+        last_ns, last_stamp_s = last_sync
+        missing = [not axis.is_complete for axis in self._axes]
+        self._emit(last_ns, missing)
         if self.period_ns is not None:
             # Frames without time stamps all have 0: their cycles are counted.
-            self._cycle += max(0, round((stamp_s - before[1]) * 1e9 / self.period_ns) - 1)
+            periods = round((stamp_s - last_stamp_s) * 1e9 / self.period_ns)
+            self._cycle += max(0, periods - 1)
 
     def _sample_asked(self, now_ns: int) -> None:
         """Make a sample of the last values, if it is due."""
-        self._sync = None
-        if now_ns < self._sample_due_ns:
+        self._last_sync = None
+        if now_ns < self._next_sample_ns:
             return
-        self._sample_due_ns = now_ns + round(READING_S * 1e9)
+        self._next_sample_ns = now_ns + round(READING_S * 1e9)
         oldest_ns = now_ns - round((2 * READING_S + ANSWER_S) * 1e9)
         missing = []
         for axis in self._axes:
@@ -350,17 +393,21 @@ class CellMonitor:
         self._emit(now_ns, missing)
 
     def _emit(self, time_ns: int, missing: list[bool]) -> None:
+        """Pass on a sample; `missing` says of each axis whether it did not answer."""
         by_axis = []
-        for axis in self._axes:
+        missing_bits = 0
+        for number, axis in enumerate(self._axes):
             by_axis.append([value or 0 for value in axis.values])
+            if missing[number]:
+                missing_bits |= 1 << number
         position, current, statusword = zip(*by_axis, strict=True)
         sample = Sample(
             cycle=self._cycle,
-            time_ns=time_ns + self._offset_ns,
+            time_ns=time_ns + self._wall_minus_monotonic_ns,
             position_counts=position,
             current_raw=current,
             statusword=statusword,
-            missing=sum(1 << number for number, absent in enumerate(missing) if absent),
+            missing=missing_bits,
         )
         self._on_sample(sample)
         self._cycle += 1

@@ -131,7 +131,7 @@ class Polling:
         if self._beside_stream:
             self._stream = stream
             self._keep = keep
-            stream.bus.spare = self._request
+            stream.bus.low_priority = self._request
 
     def _request(self, now_ns: int) -> Sequence[can.Message]:
         """Return the request that is due; none while another one waits for its answer."""

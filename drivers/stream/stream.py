@@ -59,23 +59,24 @@ class SyncStream:
         self._link = network.link
         self._answers = Answers(network.axes, network.pdos, certain=pacing.waits_for_answers)
         self._counts = self._answers.counts
-        #: What its cycles run on: frames to send with the next SYNC, and whether an axis answered
-        #: the last one.
+        #: The bus as the cycles use it. The mover adds frames to send with the next SYNC, and reads
+        #: whether an axis answered the last one.
         self.bus = CycleBus(
             network.link,
             pacing.clock,
             pacing.start_ns,
             emit=on_event,
-            between=self._process_between_cycles,
+            process_between=self._process_between_cycles,
         )
         self._watch = Watch(network, self.bus, real_time=not pacing.waits_for_answers)
         self._cycles: Cycles = pacing.cycles(self.bus)
         self._last_wrong_length: dict[int, int] = {}  # cycle, by COB-ID
-        self._read_on = False  # since the last cycle
-        self._base = Losses()  # before the first SYNC
-        self._counted = Losses()
-        self._incomplete_cycles = 0
-        self._silent_cycles = 0
+        # Whether late frames were read since the last cycle
+        self._has_read_late = False
+        self._losses_before = Losses()  # the first SYNC
+        self._losses = Losses()
+        self._incomplete_cycles = 0  # in a row
+        self._silent_cycles = 0  # in a row
 
     @property
     def time_ns(self) -> int:
@@ -85,7 +86,7 @@ class SyncStream:
     @property
     def statistics(self) -> StreamStatistics:
         """Counts up to now."""
-        losses = self._counted.since(self._base)
+        losses = self._losses.since(self._losses_before)
         return StreamStatistics(
             cycles=self.bus.cycles,
             skipped_periods=self.bus.skipped,
@@ -114,13 +115,12 @@ class SyncStream:
             BusError: the bus is lost.
             NodeMisplaced: as `next`.
         """
-        self._read_on = False
+        self._has_read_late = False
         try:
             with bus_errors(self._link.address):
                 if self.bus.cycles == 0:
                     self._begin()
-                while (instead := self._cycles.open()) is not None:
-                    self._cycles = instead
+                self._open_cycle()
                 self._collect()
         except (BusError, NodeMisplaced) as error:
             self.bus.report(None, EventKind.BUS_LOST, 0, str(error))
@@ -131,10 +131,17 @@ class SyncStream:
         """Discard the frames from before the first SYNC; losses before it do not count."""
         self.bus.begin()
         self._cycles = self._cycles.begin()
-        self._base = losses_of(self._link.bus)
-        self._counted = self._base
+        self._losses_before = losses_of(self._link.bus)
+        self._losses = self._losses_before
         for remark in remarks_of(self._link.bus):
             self.bus.report(None, EventKind.CAPTURE, 0, remark)
+
+    def _open_cycle(self) -> None:
+        """Begin a cycle with its SYNC; where SYNC comes no more, other cycles take over."""
+        successor = self._cycles.open()
+        while successor is not None:
+            self._cycles = successor
+            successor = self._cycles.open()
 
     def _slot_of(self, message: can.Message) -> Slot | None:
         """Return the slot of a TPDO of an axis; None for every other frame."""
@@ -168,18 +175,20 @@ class SyncStream:
             self.bus.answered_ns = self.bus.clock()
 
     def _note_length(self, slot: Slot, identifier: int, found: int) -> None:
-        """Report a PDO of wrong length: the first may have been corrupted,
-        one with the next SYNC too is a fault.
+        """Report a PDO of wrong length.
+
+        The first may have been corrupted on the bus. Another one in the next cycle is a fault; one
+        more in the same cycle is only counted.
         """
         self._counts["wrong_length"] += 1
         axis = self.network.axes[slot.axis]
         reason = f"PDO {identifier:03X}h has {found} bytes, its mapping has {slot.length}"
         cycle = self.bus.cycles
-        last = self._last_wrong_length.get(identifier)
-        if last is None or last < cycle - 1:
+        last_cycle = self._last_wrong_length.get(identifier)
+        if last_cycle is None or last_cycle < cycle - 1:
             text = f"{node_label(axis)}: {reason}"
             self.bus.report(slot.axis, EventKind.PDO_LENGTH, identifier, text)
-        elif last == cycle - 1:
+        elif last_cycle == cycle - 1:
             remedy = (
                 "did another program change the mapping, or does another device use this COB-ID?"
             )
@@ -189,11 +198,10 @@ class SyncStream:
     def read_on(self, seconds: float, lag_s: float = 0.0) -> None:
         """Count the frames left after the last cycle, and losses that are reported late.
 
-        Sends no SYNC.
-
-        The first call stops the SYNC that is followed. An answer more than SYNCs shows that earlier
-        ones were late (answers.py). Answers after the first call do not count: another SYNC may
-        have been sent by then, to stop axes by SDO.
+        Sends no SYNC. The first call after a cycle pauses the followed producer, and counts the
+        answers that still come: one answer too many shows that earlier ones were late (answers.py).
+        Further calls count no answers: another SYNC may have been sent by then, to stop axes by
+        SDO.
 
         Args:
             seconds: to read on; counted from the last SYNC, if more SYNCs come.
@@ -204,46 +212,57 @@ class SyncStream:
             BusError: the bus is lost, and with it the last reports.
             NodeMisplaced: as `next`.
         """
-        counted = not self._read_on
-        self._read_on = True
+        is_first_call = not self._has_read_late
+        self._has_read_late = True
         with bus_errors(self._link.address):
-            self._read_late(seconds, lag_s, counted=counted)
+            self._read_late(seconds, lag_s, count_answers=is_first_call)
         self._note_losses()
         self._watch.note_events()
 
-    def _read_late(self, seconds: float, lag_s: float, *, counted: bool) -> None:
-        """Read what comes after the last cycle; `counted` says whether answers count."""
+    def _read_late(self, seconds: float, lag_s: float, *, count_answers: bool) -> None:
+        """Read the frames after the last cycle; see `read_on`.
+
+        A SYNC among them begins another cycle, of which no sample is made.
+        """
         clock = self.bus.clock
         bus = self._link.bus
         answers = self._answers
         cycles = self._cycles
-        begun = cycles.early_sync is not None  # a cycle without a sample
-        if begun:
+        duration_ns = round(seconds * 1e9)
+        in_cycle = cycles.early_sync is not None
+        if in_cycle:
             answers.begin()
-        end_ns = clock() + round(seconds * 1e9)
-        last_ns = end_ns + round(lag_s * 1e9)
-        if counted:
+        end_ns = clock() + duration_ns
+        latest_end_ns = end_ns + round(lag_s * 1e9)
+        if count_answers:
             cycles.stop()
-        while (now_ns := clock()) < end_ns or (now_ns < last_ns and lags_behind(bus, end_ns)):
+        while True:
+            now_ns = clock()
+            if now_ns < end_ns:
+                wait_s = (end_ns - now_ns) * 1e-9
+            elif now_ns < latest_end_ns and lags_behind(bus, end_ns):
+                wait_s = PATIENCE_S
+            else:
+                break
             self._link.beat()
-            left_s = (end_ns - now_ns) * 1e-9
-            late = bus.recv(left_s if now_ns < end_ns else PATIENCE_S)
-            if late is None:
+            message = bus.recv(wait_s)
+            if message is None:
                 continue
-            if cycles.is_next_sync(late):
-                if begun:
+            if cycles.is_next_sync(message):
+                if in_cycle:
                     answers.leave()
                 answers.begin()
-                begun = True
-                end_ns = min(last_ns, max(end_ns, clock() + round(seconds * 1e9)))
-            slot = self._slot_of(late)
-            if slot is None or (counted and not begun):
-                self._process_between_cycles(late)
-            elif counted and len(late.data) == slot.length:
-                answers.take(late.arbitration_id, slot, late.data)
+                in_cycle = True
+                end_ns = max(end_ns, clock() + duration_ns)
+                end_ns = min(end_ns, latest_end_ns)
+            slot = self._slot_of(message)
+            if slot is None or (count_answers and not in_cycle):
+                self._process_between_cycles(message)
+            elif count_answers and len(message.data) == slot.length:
+                answers.take(message.arbitration_id, slot, message.data)
 
     def _process_between_cycles(self, message: can.Message) -> None:
-        """Process a frame that is read before the next SYNC, and so answers none that is open."""
+        """Process a frame that is read after a cycle has ended and before the next SYNC."""
         slot = self._slot_of(message)
         if slot is None:
             self._process_other(message)
@@ -253,12 +272,22 @@ class SyncStream:
             self._answers.take_between(slot)
 
     def _process_other(self, message: can.Message) -> None:
-        if self._link.dispatch(message) or not 0x180 <= message.arbitration_id < 0x580:
+        """Process a frame that is no mapped TPDO of an axis; count it if it is another PDO."""
+        if self._link.dispatch(message):
             return
-        ours = not message.is_extended_id and message.arbitration_id & 0x7F in self.network.node_ids
-        self._counts["surplus" if ours and self.bus.cycles else "foreign"] += 1
+        identifier = message.arbitration_id
+        is_pdo = 0x180 <= identifier < 0x580
+        if not is_pdo:
+            return
+        node_id = identifier & 0x7F
+        of_our_axis = node_id in self.network.node_ids and not message.is_extended_id
+        if of_our_axis and self.bus.cycles:
+            self._counts["surplus"] += 1
+        else:
+            self._counts["foreign"] += 1
 
     def _finish_cycle(self) -> Sample:
+        """Return the sample of the cycle, after its faults and losses are noted."""
         # A skipped period has a number too, so that a gap is visible in the samples.
         cycle = self.bus.cycles - 1 + self.bus.skipped
         missing = self._answers.end()
@@ -287,10 +316,10 @@ class SyncStream:
             self.bus.report(axis, EventKind.SAMPLE_LOST, cycle, text)
         if self._incomplete_cycles <= MAX_MISSING_CYCLES:
             return
-        silent_s = None  # doubtful answers are answers
+        # Doubtful answers (answers.py) mark an axis as missing too, but it is not silent.
+        silent_s = None
         if self.bus.silent:
-            # A reader that is late takes many cycles at once; those waited for no answer by the
-            # clock.
+            # A late reader takes many cycles at once, in almost no time by the clock.
             by_clock_ns = self.bus.clock() - self.bus.answered_ns
             by_cycles_ns = self._silent_cycles * self.pacing.period_ns
             silent_s = max(by_clock_ns, by_cycles_ns) * 1e-9
@@ -298,11 +327,11 @@ class SyncStream:
 
     def _note_losses(self) -> None:
         """Report frames that this machine lost; their content is unknown."""
-        counted = losses_of(self._link.bus)
-        if counted == self._counted:
+        losses = losses_of(self._link.bus)
+        if losses == self._losses:
             return
-        new = counted.since(self._counted)
-        self._counted = counted
+        new = losses.since(self._losses)
+        self._losses = losses
         for count, where in (
             (new.kernel, "in the kernel's receive buffer, which was full"),
             (new.interface, "by the interface, before the receive buffer"),

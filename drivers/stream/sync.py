@@ -220,11 +220,11 @@ class TimedCycles(_CyclesByClock):
         while (left_ns := self._due_ns - now_ns) > 0:
             message = bus.link.bus.recv(left_ns * 1e-9)
             if message is not None:
-                bus.between(message)
+                bus.process_between(message)
             now_ns = bus.clock()
         slipped = (now_ns - self._due_ns) // self._period_ns
         bus.skipped += slipped
-        bus.too_late(slipped * self._period_ns)
+        bus.check_lag(slipped * self._period_ns)
         bus.stamp(now_ns)
         self._due_ns += (slipped + 1) * self._period_ns
         self._deadline_ns = self._due_ns
@@ -250,7 +250,7 @@ class _CyclesByOrder(Cycles):
             if self.is_next_sync(message):
                 sync = message
             else:
-                self.bus.between(message)
+                self.bus.process_between(message)
         return sync
 
     def next_frame(self) -> can.Message | None:
@@ -291,7 +291,7 @@ class EchoedCycles(_CyclesByOrder):
             return TimedCycles(bus, self._period_ns, self._due_ns)
         now_ns = bus.clock()
         at_ns = arrived_ns(sync, now_ns)
-        bus.too_late(now_ns - at_ns)
+        bus.check_lag(now_ns - at_ns)
         if self._sent:
             _, left_out = self._sent.popleft()
             bus.skipped += left_out
@@ -304,18 +304,18 @@ class EchoedCycles(_CyclesByOrder):
         None once SYNC does not come back.
         """
         bus = self.bus
-        if self._comes_back and (taken := bus.batched()) is not None:
+        if self._comes_back and (taken := bus.next_of_burst()) is not None:
             return taken
         while self._comes_back:
             bus.link.beat()
             now_ns = bus.clock()
             if now_ns >= self._due_ns:
                 left_out = (now_ns - self._due_ns) // self._period_ns
-                bus.too_late(left_out * self._period_ns)
+                bus.check_lag(left_out * self._period_ns)
                 self._due_ns += (left_out + 1) * self._period_ns
                 bus.send_sync()
                 self._sent.append((now_ns, left_out))
-            if self._sent and bus.too_late(now_ns - self._sent[0][0]):
+            if self._sent and bus.check_lag(now_ns - self._sent[0][0]):
                 # From now on, cycles end by the clock.
                 self._comes_back = False
                 bus.skipped += sum(left_out for _, left_out in self._sent) + len(self._sent)
@@ -340,7 +340,7 @@ class FollowedCycles(_CyclesByOrder):
     def begin(self) -> Cycles:
         bus = self.bus
         begun_ns = bus.clock()
-        for message in bus.waiting():
+        for message in bus.arrived_frames():
             if (
                 is_sync(message)
                 and isinstance(message, CapturedMessage)
@@ -349,7 +349,7 @@ class FollowedCycles(_CyclesByOrder):
                 # If frames arrive as fast as they are read, the loop would not end
                 self.early_sync = message
                 break
-            bus.between(message)
+            bus.process_between(message)
         return self
 
     def open(self) -> Cycles | None:
@@ -389,7 +389,7 @@ class FollowedCycles(_CyclesByOrder):
         if pacing.producer.in_kernel and isinstance(sync, CapturedMessage) and not sync.local:
             bus.link.note_foreign(SYNC_COB_ID)
         now_ns = bus.clock()
-        bus.too_late(now_ns - at_ns)
+        bus.check_lag(now_ns - at_ns)
         pacing.producer.seen(at_ns, periods)
         self._last_sync_ns = at_ns
         bus.stamp(at_ns)
@@ -429,7 +429,7 @@ class FollowedCycles(_CyclesByOrder):
         """
         bus = self.bus
         end_ns = self._deadline_ns
-        if (taken := bus.batched()) is not None:
+        if (taken := bus.next_of_burst()) is not None:
             return taken
         recv = bus.link.bus.recv
         bus.link.beat()

@@ -90,12 +90,12 @@ def test_a_frame_that_was_queued_before_drops_does_not_lower_their_count(
         capture = Capture(bus, out, NO_INTERFACE)
         counts = iter((7, 5, 9))
         monkeypatch.setattr(
-            capture._batch, "about", lambda _number: (FRAME.size, 0, 1, next(counts))
+            capture._batch, "metadata", lambda _number: (FRAME.size, 0, 1, next(counts))
         )
         for total in (7, 7, 9):
             wire.send(FRAME.pack(0x181, 0, bytes(8)))
             assert capture.receive() == 0
-            assert capture._counts[0] == total
+            assert capture._losses[0] == total
 
 
 @settings(deadline=None)
@@ -118,7 +118,7 @@ def test_no_setting_of_the_wall_clock_moves_a_stamp(
         stamp_ns = true_ns + offset_ns
         now_ns = true_ns + wait_ns
         offset_ns += jump_ns if number == when else 0
-        found_ns = time.of(stamp_ns, now_ns + offset_ns, now_ns)
+        found_ns = time.convert(stamp_ns, now_ns + offset_ns, now_ns)
         assert last_ns <= found_ns <= now_ns
         # A step that could as well be time that has passed since the last frame cannot be
         # distinguished from it.
@@ -187,7 +187,7 @@ def test_a_stamp_of_0_is_a_stamp(monkeypatch: pytest.MonkeyPatch) -> None:
         capture = Capture(bus, out, NO_INTERFACE)
         stamps = iter((0, None))
         monkeypatch.setattr(
-            capture._batch, "about", lambda _number: (FRAME.size, 0, next(stamps), None)
+            capture._batch, "metadata", lambda _number: (FRAME.size, 0, next(stamps), None)
         )
         for _ in range(2):
             wire.send(FRAME.pack(0x181, 0, bytes(8)))
@@ -377,7 +377,7 @@ def test_a_full_transmit_queue_is_waited_for_and_then_named(
                 return 16
             raise OSError(number, "full")
 
-    monkeypatch.setattr(bus, "_socket", Full())
+    monkeypatch.setattr(bus, "_can_socket", Full())
     message = can.Message(arbitration_id=1, is_extended_id=False)
     bus.send(message)
     assert tries == 3

@@ -14,7 +14,13 @@ from drivers.canopen.link import Link
 from drivers.canopen.sdo import SdoPolicy
 from drivers.errors import BusError
 from drivers.messages import CellEvent, EventKind
-from drivers.stream.cycles import LARGEST_LAG_NS, LOOK_EVERY, CycleBus, arrived_ns, is_sync
+from drivers.stream.cycles import (
+    FRAMES_PER_CLOCK_CHECK,
+    LARGEST_LAG_NS,
+    CycleBus,
+    arrived_ns,
+    is_sync,
+)
 from tests.drivers.quiet_bus import QuietBus, frame
 from tests.drivers.scripted import FakeClock
 
@@ -59,17 +65,17 @@ def test_a_report_has_the_time_of_the_last_sync() -> None:
 
 def test_a_reader_may_be_a_second_late_and_no_nanosecond_more() -> None:
     bus = _BusOfCycles().bus
-    assert not bus.too_late(LARGEST_LAG_NS)
+    assert not bus.check_lag(LARGEST_LAG_NS)
     assert not bus.faults
     assert LARGEST_LAG_NS == SECOND_NS
-    assert bus.too_late(LARGEST_LAG_NS + 1)
+    assert bus.check_lag(LARGEST_LAG_NS + 1)
     assert len(bus.faults) == 1
 
 
 def test_a_late_reader_is_reported_once_with_its_bus_and_how_late_it_is() -> None:
     bus = _BusOfCycles().bus
-    assert bus.too_late(2_300_000_000)
-    assert bus.too_late(9_000_000_000)
+    assert bus.check_lag(2_300_000_000)
+    assert bus.check_lag(9_000_000_000)
     (fault,) = bus.faults
     assert isinstance(fault, BusError)
     assert str(fault).startswith("bus virtual:a: read 2.3 s late: moving axes cannot be watched")
@@ -88,7 +94,7 @@ def test_a_reader_that_is_too_late_leaves_the_rest_and_is_a_fault() -> None:
     made = _BusOfCycles()
     now_ns = made.wire.clock.now_ns
     made.wire.coming = [(now_ns, frame(0x181)), (now_ns, frame(0x182))]
-    for message in made.bus.waiting():
+    for message in made.bus.arrived_frames():
         made.read.append(message)
         made.wire.clock.now_ns += 2 * SECOND_NS
     assert [message.arbitration_id for message in made.read] == [0x181]
@@ -98,7 +104,7 @@ def test_a_reader_that_is_too_late_leaves_the_rest_and_is_a_fault() -> None:
 def test_frames_that_wait_are_sent_once_right_before_the_sync() -> None:
     made = _BusOfCycles()
     made.bus.outgoing.append(frame(0x201))
-    made.bus.spare = lambda _: (frame(0x301),)
+    made.bus.low_priority = lambda _: (frame(0x301),)
     made.bus.send_sync()
     assert made.sent_ids() == [0x201, 0x80]
     made.bus.send_sync()
@@ -113,7 +119,7 @@ def test_spare_frames_are_asked_for_by_the_time_of_the_last_sync() -> None:
         asked_ns.append(time_ns)
         return ()
 
-    bus.spare = none
+    bus.low_priority = none
     bus.time_ns = START_NS + 3
     assert bus.take_outgoing() == ()
     assert asked_ns == [START_NS + 3]
@@ -125,9 +131,9 @@ def test_every_64th_batched_frame_is_left_for_a_look_at_the_clock(
     made = _BusOfCycles()
     message = frame(0x181)
     monkeypatch.setattr(made.wire, "take", lambda: message, raising=False)
-    assert made.bus.batched() is None  # not begun
+    assert made.bus.next_of_burst() is None  # not begun
     made.bus.begin()
-    taken = [made.bus.batched() is message for _ in range(2 * LOOK_EVERY)]
+    taken = [made.bus.next_of_burst() is message for _ in range(2 * FRAMES_PER_CLOCK_CHECK)]
     left = [number for number, is_taken in enumerate(taken, start=2) if not is_taken]
     assert left == [64, 128]
 
