@@ -81,7 +81,7 @@ def scan_link(link: Link, node_ids: Sequence[int], wait_s: float) -> tuple[Found
     """Find all nodes that answer an SDO request or send a heartbeat within a time."""
     end_ns = link.clock() + round((wait_s + SCAN_S) * 1e9)
     answered = answering(link, node_ids, wait_s)
-    several = {n for n in answered if link.answered[n] > 1 and SDO_REQUEST + n not in link.foreign}
+    several = _answering_twice(link, answered, wait_s)
     alive = sorted(set(answered) | (set(link.nmt) & set(node_ids)))
     nothing = (None, None, None, None, None)
     found = [
@@ -175,6 +175,33 @@ def answering(link: Link, node_ids: Sequence[int], wait_s: float) -> tuple[int, 
         again.update(up)
         _ask(link, up)
     return tuple(sorted(asked & link.answered.keys()))
+
+
+def _answering_twice(link: Link, node_ids: Sequence[int], wait_s: float) -> tuple[int, ...]:
+    """Return the nodes that answer one request twice, each time they are asked.
+
+    A slow node, or one behind a slow gateway, may still answer what another program has asked: then
+    two answers come once, not again.
+
+    Args:
+        link: whose count of answers is that of one request to each node.
+        node_ids: that have answered.
+        wait_s: for the answers to a second request.
+    """
+    suspects = _several_answers(link, node_ids)
+    if suspects:
+        link.answered.clear()
+        _ask(link, suspects)
+        link.wait(wait_s)
+        suspects = _several_answers(link, suspects)
+    return suspects
+
+
+def _several_answers(link: Link, node_ids: Sequence[int]) -> tuple[int, ...]:
+    """Return the nodes of which several answers have come and that no other program has asked."""
+    return tuple(
+        n for n in node_ids if link.answered[n] > 1 and SDO_REQUEST + n not in link.foreign
+    )
 
 
 def free_ids(link: Link, node_ids: Sequence[int], wait_s: float) -> tuple[int, ...]:
