@@ -307,9 +307,9 @@ class FileImmutable(PermissionError):
             path: file that would be replaced.
             marked: the file, or its folder.
         """
-        reason = f"{marked} is marked as immutable or append-only (`chattr`)"
-        super().__init__(errno.EPERM, reason, str(path))
         self.marked = marked
+        self.reason = f"{marked} is marked as immutable or append-only (`chattr`)"
+        super().__init__(errno.EPERM, self.reason, str(path))
 
 
 class WriteUnconfirmed(OSError):
@@ -349,7 +349,7 @@ class OutputFailed(DaqError):
         if isinstance(error, FileImmutable):
             return cls(
                 str(path),
-                found=error.strerror,
+                found=error.reason,
                 expected="a file that may be replaced",
                 remedy="it is as it was; ask who set the mark and why, take it off "
                 f"(`chattr -i -a {shlex.quote(str(error.marked))}`), then repeat the command",

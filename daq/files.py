@@ -44,7 +44,8 @@ def replace_file(
 
     Raises:
         OSError: from the file system, also if owner or access lists cannot be kept, or a mark
-            forbids it (`FileImmutable`); as `judge_target`; or a folder is at `path`. The old content is in place.
+            forbids it (`FileImmutable`); as `judge_target`; or a folder is at `path`. The old
+            content is in place.
         WriteUnconfirmed: the fsync of the folder failed; the new content is in place.
     """
     target = judge_target(path)

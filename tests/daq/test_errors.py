@@ -15,8 +15,8 @@ import ident
 from daq.errors import (
     CalibrationRefused,
     DaqError,
-    OutputFailed,
     FileImmutable,
+    OutputFailed,
     OwnerNotKept,
     SchemaMismatch,
     UsageError,
