@@ -24,6 +24,7 @@ drivers.errors.DriverError is exit 5, ident.errors.IdentificationError is exit 4
 from __future__ import annotations
 
 import errno
+import shlex
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from enum import IntEnum
@@ -294,6 +295,23 @@ class OwnerNotKept(PermissionError):
         )
 
 
+class FileImmutable(PermissionError):
+    """A file or folder has a mark of its file system (``chattr +i``, ``+a``),
+    because of which even root cannot replace the file: nothing is written.
+    """
+
+    def __init__(self, path: Path, marked: Path) -> None:
+        """Store what has the mark.
+
+        Args:
+            path: file that would be replaced.
+            marked: the file, or its folder.
+        """
+        self.marked = marked
+        self.reason = f"{marked} is marked as immutable or append-only (`chattr`)"
+        super().__init__(errno.EPERM, self.reason, str(path))
+
+
 class WriteUnconfirmed(OSError):
     """The system took the new content, or a part of an entry, and failed after that:
     whether the disk has it is not known.
@@ -327,6 +345,14 @@ class OutputFailed(DaqError):
                 remedy="it is as it was; run the command as its owner and in its group (`sudo -u`, "
                 "or `usermod -aG` and a new login), or give the file to this user (`chown`, "
                 "`chgrp`) if the controller can read it then",
+            )
+        if isinstance(error, FileImmutable):
+            return cls(
+                str(path),
+                found=error.reason,
+                expected="a file that may be replaced",
+                remedy="it is as it was; ask who set the mark and why, take it off "
+                f"(`chattr -i -a {shlex.quote(str(error.marked))}`), then repeat the command",
             )
         missing = cls.of_missing_folder(path, error)
         if missing is not None:

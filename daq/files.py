@@ -11,12 +11,14 @@ import hashlib
 import os
 import pwd
 import stat
+import struct
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from io import BufferedReader
 from pathlib import Path
 
-from daq.errors import OwnerNotKept, WriteUnconfirmed
+from daq.errors import FileImmutable, OwnerNotKept, WriteUnconfirmed
 
 
 def replace_file(
@@ -41,13 +43,15 @@ def replace_file(
         like: file whose mode, owner and access lists are used instead.
 
     Raises:
-        OSError: from the file system, also if owner or access lists cannot be kept; as
-            `judge_target`; or a folder is at `path`. The old content is in place.
+        OSError: from the file system, also if owner or access lists cannot be kept, or a mark
+            forbids it (`FileImmutable`); as `judge_target`; or a folder is at `path`. The old
+            content is in place.
         WriteUnconfirmed: the fsync of the folder failed; the new content is in place.
     """
     target = judge_target(path)
     if target.is_dir():
         raise IsADirectoryError(errno.EISDIR, "is a directory", str(path))
+    _require_unmarked(path, target)
     model = like or (target if target.exists() else None)
     # For the owner alone until it has the rights of the other file: an open descriptor outlives a
     # later chmod.
@@ -69,6 +73,42 @@ def replace_file(
         fsync_folder(target.parent)
     except OSError as error:
         raise WriteUnconfirmed.of(path, error) from error
+
+
+#: ioctl_iflags(2): command and bits
+_FS_IOC_GETFLAGS = 0x80086601
+_FS_APPEND_FL = 0x20
+_FS_IMMUTABLE_FL = 0x10
+
+
+def _require_unmarked(path: Path, target: Path) -> None:
+    """Refuse a file that cannot be replaced because of a mark of it or of its folder (chattr).
+
+    Before a temporary file is made: one in a folder that may only grow could not be removed.
+
+    Raises:
+        FileImmutable: one of the two has such a mark.
+    """
+    for place in (target, target.parent):
+        if _is_marked(place):
+            raise FileImmutable(path, place)
+
+
+def _is_marked(place: Path) -> bool:
+    """Whether a file or folder is immutable or append-only; not where that cannot be asked."""
+    try:
+        descriptor = os.open(place, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    except OSError:
+        return False
+    answer = bytearray(struct.calcsize("l"))
+    try:
+        fcntl.ioctl(descriptor, _FS_IOC_GETFLAGS, answer)
+    except OSError:  # the file system has no such marks
+        return False
+    finally:
+        os.close(descriptor)
+    marks = int.from_bytes(answer[:4], sys.byteorder)
+    return bool(marks & (_FS_APPEND_FL | _FS_IMMUTABLE_FL))
 
 
 def judge_target(path: Path) -> Path:

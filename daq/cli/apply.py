@@ -30,7 +30,14 @@ from daq.cli.terminal import (
     say_last,
     write_output,
 )
-from daq.cli.verb import CalibrationArgument, JsonOption, print_json, read_cell, taking
+from daq.cli.verb import (
+    CalibrationArgument,
+    JsonOption,
+    print_json,
+    read_cell,
+    require_printable,
+    taking,
+)
 from daq.environment import login
 from daq.errors import (
     AuditUnusable,
@@ -482,13 +489,7 @@ class Applier:
 def applier(by: str | None) -> Applier:
     """Return the operator, by the name given, which must be printable."""
     user = login()
-    if by is not None and not by.isprintable():
-        raise UsageError(
-            f"--by {by!a}",
-            found="characters that cannot be shown",
-            expected="a name",
-            remedy="type it again",
-        )
+    require_printable("--by", by)
     return Applier(by or user, user)
 
 

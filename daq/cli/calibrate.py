@@ -22,7 +22,15 @@ import typer
 from daq.cli.failure import ErrorParts
 from daq.cli.output import wait_until_shown
 from daq.cli.terminal import interruptible, output_console, progress_bar, say_last
-from daq.cli.verb import CellArgument, JsonOption, output_option, print_json, read_cell, taking
+from daq.cli.verb import (
+    CellArgument,
+    JsonOption,
+    output_option,
+    print_json,
+    read_cell,
+    require_printable,
+    taking,
+)
 from daq.environment import login
 from daq.errors import ExitCode, JobHeld, UsageError
 from daq.report.text import printable
@@ -388,6 +396,7 @@ def calibrate_verb(options: CalibrateOptions) -> None:
     from daq.jobs.story import Story
     from daq.log.feed import Feed
 
+    require_printable("--by", options.by)
     declared = read_cell(options.cell)
     _check_yes_move(declared, options.yes_move)
     payload_name = options.payload or ""

@@ -13,7 +13,15 @@ import typer
 
 from daq.cli.next_step import say_after_record
 from daq.cli.terminal import interruptible, progress_bar, say, say_last
-from daq.cli.verb import CellArgument, JsonOption, output_option, print_json, read_cell, taking
+from daq.cli.verb import (
+    CellArgument,
+    JsonOption,
+    output_option,
+    print_json,
+    read_cell,
+    require_printable,
+    taking,
+)
 from daq.environment import login
 from daq.errors import DiskSpaceShort, ExitCode, OutputFailed, UsageError, counted
 from daq.files import is_taken
@@ -75,6 +83,7 @@ def record_verb(options: RecordOptions) -> None:
     from daq.workflow.record import RecordingRequest, record
     from daq.workflow.safeguards import check_entered_mass
 
+    require_printable("--operator", options.operator)
     declared = read_cell(options.cell)
     moves = slowed(declared, load_plan(options.plan, declared), options.speed)
     who = options.operator or login()

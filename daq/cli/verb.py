@@ -76,6 +76,25 @@ def output_option(name: str, about: str) -> Any:
     return typer.Option(name, help=about, callback=judged_output)
 
 
+def require_printable(option: str, name: str | None) -> None:
+    """Refuse a person's name that cannot be shown, in a log or an audit log, as it is.
+
+    Args:
+        option: as it is typed.
+        name: its value; None where it was not given.
+
+    Raises:
+        UsageError: it has control characters, marks of direction, or bytes that are no characters.
+    """
+    if name is not None and not name.isprintable():
+        raise UsageError(
+            f"{option} {name!a}",
+            found="characters that cannot be shown",
+            expected="a name",
+            remedy="type it again",
+        )
+
+
 def read_cell(path: Path) -> Cell:
     """Read a cell file.
 

@@ -376,6 +376,11 @@ OTHER_DRIVE = (
     "wiring; if the drive was exchanged, enter its `identity` in the cell file and calibrate again"
 )
 
+NO_IDENTITY = (
+    "found a node that does not tell its identity (1018h); expected that of the cell file; scan "
+    "again with a longer `--wait`; if it stays so, switch the drive off and on"
+)
+
 
 def _remarks(node: FoundNode, expected: Identity | None) -> Iterator[str]:
     """Describe what is wrong with a node."""
@@ -386,6 +391,8 @@ def _remarks(node: FoundNode, expected: Identity | None) -> Iterator[str]:
         yield from differing
         if differing:
             yield OTHER_DRIVE
+    if expected is not None and node.identity is None and not node.problems:
+        yield NO_IDENTITY
     yield from node.problems
 
 

@@ -85,7 +85,7 @@ def scan_link(link: Link, node_ids: Sequence[int], wait_s: float) -> tuple[Found
     scan_end_ns = link.clock() + round((wait_s + SCAN_S) * 1e9)
     answered = answering(link, node_ids, wait_s)
     # Counted now: the requests that follow are answered too.
-    answered_twice = [node_id for node_id in answered if _answered_twice(link, node_id)]
+    answered_twice = _answering_twice(link, answered, wait_s)
     with_heartbeat = set(link.nmt) & set(node_ids)
     found = []
     periods_ms = {}
@@ -107,12 +107,6 @@ def scan_link(link: Link, node_ids: Sequence[int], wait_s: float) -> tuple[Found
             shared = "two answers to one request for 1000h:00"
         nodes.append(replace(node, nmt=link.nmt.get(node.node_id), shared=shared))
     return tuple(nodes)
-
-
-def _answered_twice(link: Link, node_id: int) -> bool:
-    """Whether a node sent two answers to one request; not where another program asks it too."""
-    asked_by_others = SDO_REQUEST + node_id in link.foreign
-    return link.answered[node_id] > 1 and not asked_by_others
 
 
 def _unanswering_node(node_id: int) -> FoundNode:
@@ -216,6 +210,36 @@ def answering(link: Link, node_ids: Sequence[int], wait_s: float) -> tuple[int, 
         asked_again.update(booted)
         _request_device_type(link, booted)
     return tuple(sorted(asked & link.answered.keys()))
+
+
+def _answering_twice(link: Link, node_ids: Sequence[int], wait_s: float) -> tuple[int, ...]:
+    """Return the nodes that answer one request twice, each time they are asked.
+
+    A slow node, or one behind a slow gateway, may still answer what another program has asked: then
+    two answers come once, not again.
+
+    Args:
+        link: whose count of answers is that of one request to each node.
+        node_ids: that have answered.
+        wait_s: for the answers to a second request.
+    """
+    suspects = _several_answers(link, node_ids)
+    if suspects:
+        link.answered.clear()
+        _request_device_type(link, suspects)
+        link.wait(wait_s)
+        suspects = _several_answers(link, suspects)
+    return suspects
+
+
+def _several_answers(link: Link, node_ids: Sequence[int]) -> tuple[int, ...]:
+    """Return the nodes of which several answers have come and that no other program has asked."""
+    found: list[int] = []
+    for node_id in node_ids:
+        asked_by_others = SDO_REQUEST + node_id in link.foreign
+        if link.answered[node_id] > 1 and not asked_by_others:
+            found.append(node_id)
+    return tuple(found)
 
 
 def free_ids(link: Link, node_ids: Sequence[int], wait_s: float) -> tuple[int, ...]:

@@ -15,6 +15,7 @@ import ident
 from daq.errors import (
     CalibrationRefused,
     DaqError,
+    FileImmutable,
     OutputFailed,
     OwnerNotKept,
     SchemaMismatch,
@@ -46,14 +47,15 @@ def test_every_exception_class_has_an_exit_code() -> None:
     assert {SetupRefused, RankDeficient, SchemaMismatch} <= kinds
     # The root of daq is never raised; SdoAbort is how a simulated node says no on the bus,
     # FeedUnfit is said on the console's page, TransferUnboundedError becomes an ObjectAccessError,
-    # OwnerNotKept and WriteUnconfirmed are OSErrors that become an OutputFailed, ShapeUnreadable is
-    # listed in a model: they end no command.
+    # OwnerNotKept, FileImmutable and WriteUnconfirmed are OSErrors that become an OutputFailed,
+    # ShapeUnreadable is listed in a model: they end no command.
     inner = {
         DaqError,
         SdoAbort,
         FeedUnfit,
         TransferUnboundedError,
         OwnerNotKept,
+        FileImmutable,
         WriteUnconfirmed,
         ShapeUnreadable,
     }

@@ -13,8 +13,16 @@ WAIT_S = 30.0
 
 @contextmanager
 def raw_client(hub: Hub) -> Iterator[socket.socket]:
-    """Open a connection in raw mode."""
+    """Open a connection to a hub of this process in raw mode."""
     port = hub.address().port
+    assert port is not None
+    with raw_client_at(port) as client:
+        yield client
+
+
+@contextmanager
+def raw_client_at(port: int) -> Iterator[socket.socket]:
+    """Open a connection in raw mode to the hub that listens there."""
     with socket.create_connection((HOST, port), timeout=WAIT_S) as client:
         client.sendall(b"< open can0 >< rawmode >")
         heard = b""

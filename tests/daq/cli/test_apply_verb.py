@@ -12,7 +12,8 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
+import tempfile
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -71,8 +72,13 @@ class Bench:
 @pytest.fixture
 def bench(tmp_path: Path) -> Bench:
     """In folders with blanks in their names."""
-    cells = tmp_path / "the cells"
-    controllers = tmp_path / "controllers"
+    return _bench_in(tmp_path)
+
+
+def _bench_in(folder: Path) -> Bench:
+    """A cell in a folder."""
+    cells = folder / "the cells"
+    controllers = folder / "controllers"
     cells.mkdir()
     controllers.mkdir()
     demo_path = CONFIGS / "cells" / "demo.yaml"
@@ -85,10 +91,10 @@ def bench(tmp_path: Path) -> Bench:
     changed_calibration = replace(calibration, configuration_sha256=configuration_sha256)
     save_calibration(
         changed_calibration,
-        tmp_path / "calibration.yaml",
+        folder / "calibration.yaml",
     )
     controller = controllers / "demo.yaml"
-    calibration_path = tmp_path / "calibration.yaml"
+    calibration_path = folder / "calibration.yaml"
     return Bench(cell, controller, calibration_path)
 
 
@@ -638,6 +644,55 @@ def test_a_rollback_writes_into_no_other_file(bench: Bench) -> None:
             main(["rollback", "--to", str(bench.controller), "--audit", str(audit)]) != ExitCode.OK
         )
     assert (bench.cell.read_bytes(), bench.controller.read_bytes()) == (cell, written)
+
+
+@pytest.fixture
+def open_bench() -> Iterator[Bench]:
+    """In folders that every user can write to; those of pytest are their owner's alone."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        bench = _bench_in(folder)
+        for place in (folder, bench.cell.parent, bench.controller.parent):
+            place.chmod(0o777)
+        yield bench
+
+
+NOBODY = 65534
+FOREIGN_GROUP = 4711  #: No one is in it
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root may give a file to another user")
+@pytest.mark.parametrize("verb", ["apply", "rollback"])
+def test_a_controller_file_of_a_foreign_group_stays_and_its_group_is_named(
+    open_bench: Bench, verb: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It was "operation not permitted … free space or rights"."""
+    command = open_bench.apply
+    if verb == "rollback":
+        assert open_bench.apply("--yes") == ExitCode.OK
+        command = open_bench.rollback
+    controller = open_bench.controller
+    os.chown(controller, NOBODY, FOREIGN_GROUP)
+    for place in open_bench.cell.parent.iterdir():
+        os.chown(place, NOBODY, -1)
+    before = controller.read_bytes()
+    names = {path.name for path in controller.parent.iterdir()}
+    capsys.readouterr()
+    os.seteuid(NOBODY)
+    try:
+        code = command("--yes")
+    finally:
+        os.seteuid(0)
+    assert code == ExitCode.UNEXPECTED
+    said = capsys.readouterr().err
+    assert "a file of its group 4711, not " in said
+    assert "it is as it was; run the command as its owner and in its group" in said
+    assert "free space" not in said
+    assert controller.read_bytes() == before
+    assert {path.name for path in controller.parent.iterdir()} == names
+    begun, failed = read(open_bench.audit)[-2:]
+    assert failed.action is AuditAction.FAILED
+    assert failed.details["begun"] == begun.number
 
 
 def test_whatever_the_history_does_a_write_is_not_called_undone(

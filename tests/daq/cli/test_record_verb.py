@@ -160,3 +160,32 @@ def test_a_lost_sample_with_a_timed_pacing_names_lockstep(
     assert ("hint:" in output) is hinted
     assert ("`sync.pacing: lockstep`" in output) is hinted
     assert "kept:" not in output
+
+
+@pytest.mark.parametrize("name", ["A\nB", "A\udcff", "A\x1b[31m", "A\u202e"])
+@pytest.mark.parametrize(
+    ("verb", "option"),
+    [
+        (("record", "plan.yaml", "--out", "a.mcap", "--enable-motion"), "--operator"),
+        (("calibrate",), "--by"),
+    ],
+    ids=["record", "calibrate"],
+)
+def test_an_operator_whose_name_cannot_be_shown_is_refused_before_anything_moves(
+    checkout: Path,
+    tmp_path: Path,
+    verb: tuple[str, ...],
+    option: str,
+    name: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """`apply` refused it; here it would have gone into the log."""
+    monkeypatch.chdir(tmp_path)
+    cell = checkout / "configs" / "cells" / "demo.yaml"
+    first, *rest = verb
+    assert run_verb(first, cell, *rest, option, name) == ExitCode.USAGE
+    said = capsys.readouterr().err
+    assert f"{option} {name!a}" in said
+    assert "characters that cannot be shown" in said
+    assert list(tmp_path.iterdir()) == []

@@ -25,7 +25,14 @@ from daq.config.cell_buses import bus_address, drive_axes
 from daq.config.cell_file import bundle, cell_from_bundle
 from daq.errors import ExitCode
 from daq.log.reader import read_log
-from daq.report.bus_views import OTHER_DRIVE, scan_report, scan_table, scan_view, scanned_nodes
+from daq.report.bus_views import (
+    NO_IDENTITY,
+    OTHER_DRIVE,
+    scan_report,
+    scan_table,
+    scan_view,
+    scanned_nodes,
+)
 from daq.simulation.simulation_file import load_simulation, shipped_simulation
 from daq.workflow.bus_lock import bus_lock
 from drivers.canopen.bus import open_bus
@@ -205,6 +212,17 @@ def test_a_cell_without_serial_does_not_compare_it(cell: Cell) -> None:
     changed_cell = replace(cell, axes=axes)
     (row, *_) = scanned_nodes(changed_cell, (_node(1, 0x250, serial=9),), "demo")
     assert (row.verdict, row.remarks) == ("ok", [])
+
+
+def test_a_node_that_answers_no_request_is_remarked(cell: Cell) -> None:
+    """The table alone said `no identity`, and no word what to do."""
+    beating = FoundNode(1, None, None, None, 0x7F, None)
+    (row, *_) = scanned_nodes(cell, (beating,), "demo")
+    assert row.verdict == "no identity"
+    assert row.remarks == [NO_IDENTITY]
+    overloaded = replace(beating, problems=("object 1018h:01: 64 answers to other requests",))
+    (row, *_) = scanned_nodes(cell, (overloaded,), "demo")
+    assert row.remarks == list(overloaded.problems)
 
 
 def test_two_devices_and_a_profile_that_does_not_fit_are_said(cell: Cell) -> None:

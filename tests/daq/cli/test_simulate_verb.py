@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,7 +23,14 @@ from daq.workflow.bus_lock import bus_lock, require_untaken
 from drivers.canopen.bus import BusAddress
 from drivers.canopen.split_bus import BusPart
 from drivers.simulation.spec import CellSpec
+from tests.daq.command_line import run_verb
+from tests.drivers.raw_client import raw_client_at
 from tests.drivers.simulation.cells import clean_cell
+from tests.pipeline.simulated_bus import served_cell
+
+FLOOD = b"< send 123 8 01 02 03 04 05 06 07 08 >" * 1000
+FLOOD_BYTES = 20_000_000
+RECOVERY_S = 60.0  #: The simulated drives work off what has come
 
 
 def test_each_bus_has_its_nodes() -> None:
@@ -121,6 +130,31 @@ def test_a_bus_that_fails_is_an_error_with_a_remedy(
     said = capsys.readouterr().err
     assert "virtual:failing" in said
     assert "the server closed the connection" in said
+
+
+@pytest.mark.slow
+def test_a_flood_of_one_client_ends_neither_the_simulated_cell_nor_its_answers(
+    checkout: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """20 MB from one client ended `simulate` with exit code 5; `served_cell` expects 0."""
+    with served_cell(tmp_path, checkout) as cell:
+        port = load_cell(cell).buses[0].port
+        with raw_client_at(port) as hostile:
+            for _ in range(FLOOD_BYTES // len(FLOOD)):
+                hostile.sendall(FLOOD)
+        # `served_cell` has read what the simulated cell prints before
+        assert capfd.readouterr().err.count("\n") <= 1
+        end_s = time.monotonic() + RECOVERY_S
+        verdicts: set[str] = set()
+        while verdicts != {"ok"} and time.monotonic() < end_s:
+            code = run_verb("scan", cell, "--json")
+            said = capfd.readouterr()
+            assert "two devices" not in said.out
+            if code == ExitCode.OK:
+                nodes = json.loads(said.out)["nodes"]
+                verdicts = {node["verdict"] for node in nodes}
+        assert verdicts == {"ok"}
+    assert capfd.readouterr().err == ""
 
 
 def test_a_pipe_names_no_body(tmp_path: Path) -> None:

@@ -67,6 +67,7 @@ from daq.workflow.plan import Plan, load_plan, plan
 from daq.workflow.record import Recorded, RecordingRequest
 from drivers.errors import MotionRefused
 from ident.errors import CORRECTION_UNCLEAR, ChannelsExchanged, Diagnosis, GeometryTurned
+from tests.daq.documented_keys import undocumented_keys
 from tests.daq.histories import history_of
 from tests.daq.jobs.made_session import (
     BLOCK_S,
@@ -132,6 +133,7 @@ def test_a_session_over_the_driver_finds_the_gains_writes_them_once_and_accepts_
         AuditAction.ACCEPTED,
         AuditAction.RECALIBRATION_ENDED,
     ]
+    assert undocumented_keys(rig.audit) == {}
     events = history_of(rig.cell_file).events
     assert len(events) == 1
     assert len(rig.backups) == 1
@@ -181,6 +183,7 @@ def test_a_gain_that_is_wrong_after_the_write_is_not_accepted(
     (entry,) = [entry for entry in rig.audit if entry.action is AuditAction.NOT_ACCEPTED]
     assert entry.details["remark"] == acceptance.remark
     assert entry.details["undo"] == undo
+    assert undocumented_keys(rig.audit) == {}
     (event,) = [event for event in rig.events if event["event"] == "not accepted"]
     assert event["undo"] == undo
     report_folder = rig.session.folder / "report"

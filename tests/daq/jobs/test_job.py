@@ -16,6 +16,7 @@ from daq.errors import ExitCode
 from daq.jobs import session as sessions
 from daq.jobs.recording import basis_of
 from daq.ledger.audit import AuditAction, noted_heads
+from tests.daq.documented_keys import undocumented_keys
 from tests.daq.histories import history_of
 from tests.daq.jobs.made import Made, made_rig
 from tests.daq.jobs.rig import WHO, Rig
@@ -54,6 +55,7 @@ def test_a_whole_job_applies_what_it_found_and_leaves_everything_that_records_it
         AuditAction.RECALIBRATION_ENDED,
     ]
     assert actions == expected
+    assert undocumented_keys(rig.audit) == {}
     details = rig.audit[-1].details
     assert details["outcome"] == "applied"
     sha256 = rig.audit[-1].sha256

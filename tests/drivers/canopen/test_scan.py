@@ -161,6 +161,24 @@ def test_two_devices_with_one_node_id_are_found(serial: int) -> None:
     assert "two answers to one request for 10" in found[1].shared
 
 
+def test_a_late_answer_to_another_program_is_no_second_device() -> None:
+    """After 20 MB from one client, the simulated cell still answered the scan before."""
+    network, bus = cell(2)
+    answers: list[can.Message] = []
+
+    def late_once(message: can.Message) -> tuple[can.Message, ...]:
+        if message.arbitration_id != 0x582 or answers:
+            return (message,)
+        answers.append(message)
+        return (message, message)
+
+    with network:
+        bus.tamper = late_once
+        found = network.scan(wait_s=0.05)
+    assert len(answers) == 1
+    assert [node.shared for node in found] == ["", ""]
+
+
 @pytest.mark.parametrize("serial", [7, 8], ids=["equal answers", "other serial"])
 def test_they_are_refused_before_anything_is_written(serial: int) -> None:
     network, bus = twins(serial)
