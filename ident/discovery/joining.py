@@ -17,7 +17,7 @@ import numpy as np
 
 from ident.arrays import FloatArray
 from ident.discovery.beside_stops import fitted_clear_of_stops, turns_with_motion
-from ident.discovery.braking import pushing
+from ident.discovery.braking import describe_driving_friction
 from ident.discovery.candidates import (
     ColumnCache,
     FamilyTrials,
@@ -444,7 +444,7 @@ def beside_others(
         uncertain = _uncertain_delay(finding, values, deviations, gates)
     physics = impossible(placed.effect.coefficients, values, deviations)
     if isinstance(placed.effect, SpeedFriction | PositionFriction):
-        drives = pushing(model.evidence, placed.axis)
+        drives = describe_driving_friction(model.evidence, placed.axis)
     else:
         drives = ""
     reasons = (
