@@ -20,7 +20,7 @@ import numpy as np
 from ident.arrays import BoolArray, FloatArray, IntArray
 from ident.data.frozen import clipped_position, frozen_current, frozen_position, frozen_to_the_end
 from ident.data.glitches import Jumps, Readings, find_jumps, is_split, smallest_change, wrap_size
-from ident.data.held import fill_damaged, held_channel, longest_smooth
+from ident.data.held import fill_damaged, longest_cubic_fill, samples_to_fill
 
 LARGEST_GLITCHED = 0.01  #: Largest share of the samples of a channel that is filled in
 LARGEST_FROZEN = 0.1  #: Largest share of the samples that is left out
@@ -310,12 +310,12 @@ def mended(
     replaced = replaced_samples(faults, quantity, values.shape, ratio)
     if not np.any(replaced):
         return values
-    longest = 0
+    longest_cubic = 0
     if quantity is ChannelKind.POSITION:
-        longest = longest_smooth(rate_hz)
+        longest_cubic = longest_cubic_fill(rate_hz)
     columns: list[FloatArray] = []
     for own, wrong in zip(values.T, replaced.T, strict=True):
-        columns.append(fill_damaged(own, wrong, longest, time))
+        columns.append(fill_damaged(own, wrong, longest_cubic, time))
     return np.stack(columns, axis=1)
 
 
@@ -382,7 +382,7 @@ def _readings(channels: FloatArray, rate_hz: float) -> Iterator[Readings]:
         if count is not None:
             coarsest = max(coarsest, count)
     for values, count in zip(channels.T, counts, strict=True):
-        held = held_channel(values, rate_hz)
+        held = samples_to_fill(values, rate_hz)
         if held is None:
             sample = np.arange(len(values))
         else:

@@ -1,30 +1,32 @@
-"""Whether the friction of an axis brakes at every speed and position: it never drives the arm.
+"""Check that the friction of an axis brakes at every speed and position, and never drives the arm.
 
-A joint fit is of the speeds that its runs have. Terms that depend on the speed alone can stand in
-for each other there: drag by a root of the speed, with a dry friction below zero, is right from a
-tenth of full speed on, and wrong below it. An axis of a real robot moved slowly in a region that
-was left out: there such a fit was off by 18 % of the torque, and the fit without the term by 5 %.
-Friction that depends on the position can be below zero where no run has been.
-So dry and viscous friction are judged together with all effects of the speed and of the position on
-the axis,
+A fit knows the friction only at the speeds of its runs. There, two terms of the speed can
+compensate each other: drag that grows with a root of the speed, with a negative dry friction, fits
+from a tenth of full speed on, and is wrong below. On a real robot that was moved slowly through a
+region that the fit had not seen, such a fit was off by 18 % of the torque, the fit without the term
+by 5 %. Likewise, friction that depends on the position can be negative where no run has been.
+
+So the declared dry and viscous friction is judged together with all effects of the speed and of the
+position on its axis. With c, a and b their coefficients, it is
 
     f(v, q) = fs + fv |v| + sign(v) Σ c φ(v) + a cos q + b sin q ≥ 0,
 
-for 0 < |v| ≤ the largest speed of the runs, in both directions, and all q within the joint's travel
-about the middle of its runs. It may be below zero by no more than SIGMAS of its own σ. At rest,
-f is what the friction of the axis begins with. Friction that grows with the load, or depends on
-the distance, brakes too and is left out. An axis whose friction depends on the temperature is not
-judged: fs and fv are then those of a temperature that the runs need not have.
+for 0 < |v| ≤ the largest speed of the runs, in both directions, and for all q within the joint's
+travel about the middle of its runs. The limit v → 0 is the friction at which the axis begins to
+move. f is refused where it is below zero by more than SIGMAS of its own σ.
+
+Friction that grows with the load, or depends on the distance, brakes by itself and is left out. An
+axis whose friction depends on the temperature is not judged: its fs and fv are those at a
+temperature that the runs may not have had.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from ident.arrays import FloatArray
+from ident.arrays import FloatArray, IntArray
 from ident.discovery.evidence import Evidence
 from ident.discovery.gates import SIGMAS, own_unknowns
 from ident.effects.effect import PlacedEffect
@@ -33,59 +35,80 @@ from ident.effects.signals import Abscissa
 from ident.model.bodies import LOADED
 from ident.model.regressor import cos_sin
 
+#: Speeds at which friction is judged, as shares of the largest; the first is the limit at rest
 SPEEDS = np.concatenate(([1e-6], np.geomspace(1e-3, 1.0, 25)))
-"""Shares of the largest speed; the first one stands for the limit at rest."""
-
+#: Positions at which friction that depends on the position is judged: over one turn, 7.7° apart
 POSITIONS = 48
-"""Positions at which friction that depends on the position is judged: 7.5° of a turn."""
 
 
-def pushing(evidence: Evidence, axis: int) -> str:
-    """Say where the friction of an axis would push; empty where it brakes everywhere.
+def describe_driving_friction(evidence: Evidence, axis: int) -> str:
+    """Say where the friction of an axis would drive the arm; empty where it brakes everywhere.
 
     Args:
         evidence: a joint fit.
         axis: index of the axis.
     """
-    of_axis = [placed for placed in evidence.effects if placed.axis == axis]
-    of_speed: list[tuple[PlacedEffect, SpeedFriction]] = []
-    of_position: list[PlacedEffect] = []
-    for placed in of_axis:
-        if placed.effect.abscissa is Abscissa.TEMPERATURE:
-            return ""
-        if isinstance(placed.effect, SpeedFriction):
-            of_speed.append((placed, placed.effect))
-        if isinstance(placed.effect, PositionFriction):
-            of_position.append(placed)
-    if not of_speed and not of_position:
+    effects = _judged_effects(evidence, axis)
+    if effects is None:
         return ""
     positions_rad = np.zeros(1)
-    if of_position:
+    if effects.of_position:
         positions_rad = _positions(evidence, axis)
-    speeds = [np.abs(data.velocity_rad_s[:, axis]) for data in evidence.fit_runs]
-    fastest = max(float(np.max(speed)) for speed in speeds)
-    found: list[_Friction] = []
+    largest_speed = 0.0
+    for data in evidence.fit_runs:
+        speed = np.abs(data.velocity_rad_s[:, axis])
+        largest_speed = max(largest_speed, float(speed.max()))
+    judged: list[_Friction] = []
     for declared in _declared_friction(evidence, axis):
         for direction in (1.0, -1.0):
-            velocity = direction * fastest * SPEEDS
-            found += _friction_at(
-                evidence, declared, of_speed, of_position, velocity, positions_rad
-            )
-    worst = min(found, key=lambda one: one.at_most, default=None)
-    if worst is None or worst.at_most >= 0.0:
+            velocities = direction * largest_speed * SPEEDS
+            judged += _friction_at(evidence, declared, effects, velocities, positions_rad)
+    worst = min(judged, key=lambda friction: friction.largest_possible, default=None)
+    if worst is None or worst.largest_possible >= 0.0:
         return ""
-    where = _place(worst, fastest)
-    if of_position:
-        where += f", where its position is {worst.position_rad:.2g} rad"
+    place = _velocity_text(worst, largest_speed)
+    if effects.of_position:
+        place += f", where its position is {worst.position_rad:.2g} rad"
     torque = f"{worst.torque:.3g} ± {worst.std:.2g} {worst.unit}"
-    return f"the friction of this axis would push the arm {where} ({torque})"
+    return f"the friction of this axis would push the arm {place} ({torque})"
+
+
+@dataclass(frozen=True, slots=True)
+class _JudgedEffects:
+    """Effects of an axis that are part of f(v, q)."""
+
+    of_speed: tuple[tuple[PlacedEffect, SpeedFriction], ...]
+    of_position: tuple[PlacedEffect, ...]
+
+
+def _judged_effects(evidence: Evidence, axis: int) -> _JudgedEffects | None:
+    """Effects of the speed and of the position on an axis.
+
+    None where there are none, or where its friction depends on the temperature.
+    """
+    of_speed: list[tuple[PlacedEffect, SpeedFriction]] = []
+    of_position: list[PlacedEffect] = []
+    for placed in evidence.effects:
+        effect = placed.effect
+        if placed.axis != axis:
+            continue
+        if effect.abscissa is Abscissa.TEMPERATURE:
+            return None
+        if isinstance(effect, SpeedFriction):
+            of_speed.append((placed, effect))
+        if isinstance(effect, PositionFriction):
+            of_position.append(placed)
+    if not of_speed and not of_position:
+        return None
+    return _JudgedEffects(tuple(of_speed), tuple(of_position))
 
 
 @dataclass(frozen=True, slots=True)
 class _Declared:
-    """Dry and viscous friction of an axis, as places among the parameters.
+    """Indices of an axis' dry and viscous friction among the parameters of an estimate.
 
-    With a load, several parameters make the sum.
+    With a payload mounted, dry friction is the sum of two parameters, and viscous friction too
+    (`Model.friction_by_payload`).
     """
 
     dry: tuple[int, ...]
@@ -95,108 +118,131 @@ class _Declared:
 
 @dataclass(frozen=True, slots=True)
 class _Friction:
-    """Friction of an axis at one speed and position; positive where it brakes."""
+    """Friction of an axis at one velocity and position, positive where it brakes."""
 
-    speed: float  #: [rad/s or m/s]
+    velocity: float  #: signed [rad/s or m/s]
     position_rad: float  #: 0 where no friction depends on it
-    torque: float  #: [unit]
+    torque: float  #: f [unit]
     std: float  #: [unit]
     unit: str
 
     @property
-    def at_most(self) -> float:
-        """The largest friction that its σ allows [unit]."""
+    def largest_possible(self) -> float:
+        """The upper end of its confidence interval, f + SIGMAS σ [unit]."""
         return self.torque + SIGMAS * self.std
 
 
-def _place(worst: _Friction, fastest: float) -> str:
-    """At which speed a friction is, in words."""
-    if abs(worst.speed) < 2.0 * fastest * SPEEDS[0]:
+def _velocity_text(friction: _Friction, largest_speed: float) -> str:
+    """Velocity of a friction for a sentence: ``at rest``, ``at -0.3 rad/s``."""
+    speed_at_rest = largest_speed * SPEEDS[0]
+    if abs(friction.velocity) < 2.0 * speed_at_rest:
         return "at rest"
-    if worst.unit == "N":
-        return f"at {worst.speed:.2g} m/s"
-    return f"at {worst.speed:.2g} rad/s"
+    if friction.unit == "N":
+        return f"at {friction.velocity:.2g} m/s"
+    return f"at {friction.velocity:.2g} rad/s"
 
 
 def _declared_friction(evidence: Evidence, axis: int) -> list[_Declared]:
-    """The declared friction of an axis without load, and with it where that is another one.
+    """The declared friction of an axis without payload, and with it where that is another one.
 
     Empty where a part of it is regrouped into other parameters.
     """
     model = evidence.model
-    places: dict[str, int] = {}
-    for place, column in enumerate(evidence.estimate.unknowns):
-        standard, *_ = column.name.split(" ", 1)
-        places[standard] = place
+    index_of: dict[str, int] = {}
+    for index, unknown in enumerate(evidence.estimate.unknowns):
+        # A base parameter is called after its leading standard parameter: "fs2 + 1*Iam3"
+        leading_name, *_ = unknown.name.split(" ", 1)
+        index_of[leading_name] = index
     dry = model.columns[model.dry_friction_columns[axis]]
-    viscous = model.columns[model.viscous_friction_columns[axis]].name
-    if dry.name not in places or viscous not in places:
+    viscous = model.columns[model.viscous_friction_columns[axis]]
+    if dry.name not in index_of or viscous.name not in index_of:
         return []
-    bare = _Declared((places[dry.name],), (places[viscous],), dry.unit)
-    more_dry = places.get(f"{dry.name}{LOADED}")
-    more_viscous = places.get(f"{viscous}{LOADED}")
-    if more_dry is None or more_viscous is None:
+    dry_index = index_of[dry.name]
+    viscous_index = index_of[viscous.name]
+    bare = _Declared((dry_index,), (viscous_index,), dry.unit)
+    dry_change = index_of.get(f"{dry.name}{LOADED}")
+    viscous_change = index_of.get(f"{viscous.name}{LOADED}")
+    if dry_change is None or viscous_change is None:
         return [bare]
-    loaded = _Declared((*bare.dry, more_dry), (*bare.viscous, more_viscous), dry.unit)
+    loaded_dry = (dry_index, dry_change)
+    loaded_viscous = (viscous_index, viscous_change)
+    loaded = _Declared(loaded_dry, loaded_viscous, dry.unit)
     return [bare, loaded]
 
 
 def _positions(evidence: Evidence, axis: int) -> FloatArray:
     """Positions of a joint at which its friction is judged, shape (POSITIONS,).
 
-    They reach as far as its travel, about the middle of its runs; a turn holds all of a cosine.
+    They cover its travel about the middle of its runs, or one turn where that is less (cos q and
+    sin q repeat), and at least the positions of its runs.
     """
     robot = evidence.model.robot
     joint = robot.joints[robot.axis_joints[axis]]
-    reach_rad = 2.0 * np.pi
+    covered_rad = 2.0 * np.pi
     if joint.travel is not None:
-        reach_rad = min(joint.travel, reach_rad)
-    lowest = min(float(np.min(data.position_rad[:, axis])) for data in evidence.fit_runs)
-    highest = max(float(np.max(data.position_rad[:, axis])) for data in evidence.fit_runs)
-    reach_rad = max(reach_rad, highest - lowest)
+        covered_rad = min(joint.travel, covered_rad)
+    lowest = np.inf
+    highest = -np.inf
+    for data in evidence.fit_runs:
+        position = data.position_rad[:, axis]
+        lowest = min(lowest, float(position.min()))
+        highest = max(highest, float(position.max()))
+    covered_rad = max(covered_rad, highest - lowest)
     middle = 0.5 * (lowest + highest)
-    return middle + reach_rad * np.linspace(-0.5, 0.5, POSITIONS)
+    return middle + covered_rad * np.linspace(-0.5, 0.5, POSITIONS)
 
 
 def _friction_at(
     evidence: Evidence,
     declared: _Declared,
-    of_speed: Sequence[tuple[PlacedEffect, SpeedFriction]],
-    of_position: Sequence[PlacedEffect],
-    speeds: FloatArray,
+    effects: _JudgedEffects,
+    velocities: FloatArray,
     positions_rad: FloatArray,
 ) -> list[_Friction]:
-    """Friction at each of some velocities of one sign, shape (k,), and positions, shape (n,)."""
+    """Friction of an axis at every pair of a velocity and a position.
+
+    Args:
+        evidence: a joint fit.
+        declared: its dry and viscous friction.
+        effects: its effects of the speed and of the position.
+        velocities: all of one sign, shape (v,).
+        positions_rad: shape (p,).
+
+    Returns:
+        v · p values of f.
+    """
     estimate = evidence.estimate
-    values = np.concatenate((estimate.gains, estimate.parameters))
-    first = len(estimate.gains)
-    dry = first + np.array(declared.dry)
-    viscous = first + np.array(declared.viscous)
-    velocity = np.repeat(speeds, len(positions_rad))
-    position_rad = np.tile(positions_rad, len(speeds))
-    # Row k of the weights w is ∂f(v_k, q_k)/∂(g, χ): f = w χ, and its variance is w C wᵀ.
-    weights = np.zeros((len(velocity), len(values)))
+    unknowns = np.concatenate((estimate.gains, estimate.parameters))
+    gain_count = len(estimate.gains)
+
+    def indices(placed: PlacedEffect) -> IntArray:
+        """Where the coefficients of an effect are among the unknowns."""
+        return gain_count + own_unknowns(estimate, (placed,))
+
+    velocity = np.repeat(velocities, len(positions_rad))
+    position_rad = np.tile(positions_rad, len(velocities))
+    # Row k of the weights w is ∂f(v_k, q_k)/∂(g, χ): f = w (g, χ), and its variance is w C wᵀ.
+    weights = np.zeros((len(velocity), len(unknowns)))
+    dry = gain_count + np.array(declared.dry)
+    viscous = gain_count + np.array(declared.viscous)
     weights[:, dry] = 1.0
     weights[:, viscous] = np.abs(velocity)[:, None]
-    for placed, effect in of_speed:
-        against_motion = np.sign(velocity) * effect.at_speed(velocity)
-        of_effect = first + own_unknowns(estimate, (placed,))
-        weights[:, of_effect] = against_motion.T
-    for placed in of_position:
-        of_effect = first + own_unknowns(estimate, (placed,))
-        weights[:, of_effect] = np.stack(cos_sin(position_rad), axis=-1)
-    torque = weights @ values
+    for placed, effect in effects.of_speed:
+        per_coefficient = np.sign(velocity) * effect.at_speed(velocity)
+        weights[:, indices(placed)] = per_coefficient.T
+    for placed in effects.of_position:
+        weights[:, indices(placed)] = np.stack(cos_sin(position_rad), axis=-1)
+    torque = weights @ unknowns
     variance = np.einsum("kp,pq,kq->k", weights, estimate.covariance, weights, optimize=True)
     std = np.sqrt(variance)
     found: list[_Friction] = []
-    for place in range(len(velocity)):
-        found.append(
-            _Friction(
-                speed=float(velocity[place]),
-                position_rad=float(position_rad[place]),
-                torque=float(torque[place]),
-                std=float(std[place]),
-                unit=declared.unit,
-            )
+    for row in range(len(velocity)):
+        friction = _Friction(
+            velocity=float(velocity[row]),
+            position_rad=float(position_rad[row]),
+            torque=float(torque[row]),
+            std=float(std[row]),
+            unit=declared.unit,
         )
+        found.append(friction)
     return found

@@ -15,7 +15,7 @@ import numpy as np
 from ident.arrays import FloatArray, require_names, takes
 from ident.data.conditioning import Conditioning
 from ident.data.dataset import Dataset, differentiate
-from ident.data.demand import Demands, as_demanded, with_demand
+from ident.data.demand import DemandCache, as_demanded, with_demand
 from ident.data.run import Run
 from ident.data.run_channels import channels_of
 from ident.discovery.gates import own_unknowns, values_of
@@ -70,8 +70,8 @@ class Evidence:
     #: (`ident.effects.geometry_corrections`).
     corrections: tuple[PlacedEffect, ...] = ()
     uncorrected: Uncorrected | None = None  #: as they were before; None where nothing was corrected
-    #: of the runs as they were given
-    demands: Demands = field(default_factory=Demands, repr=False, compare=False)
+    #: demanded positions of the runs as they were given
+    demands: DemandCache = field(default_factory=DemandCache, repr=False, compare=False)
     _identification: list[Identification] = field(
         default_factory=list, init=False, repr=False, compare=False
     )

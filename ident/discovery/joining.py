@@ -17,7 +17,7 @@ import numpy as np
 
 from ident.arrays import FloatArray
 from ident.discovery.beside_stops import fitted_clear_of_stops, turns_with_motion
-from ident.discovery.braking import pushing
+from ident.discovery.braking import describe_driving_friction
 from ident.discovery.candidates import (
     ColumnCache,
     FamilyTrials,
@@ -50,7 +50,7 @@ from ident.discovery.gates import (
 )
 from ident.discovery.late_currents import Delay
 from ident.discovery.refinement import refine_together
-from ident.discovery.rotor_search import refined_rotor
+from ident.discovery.rotor_search import with_refined_rotor
 from ident.discovery.search import EffectKey, Finding, effect_key, is_better, rank_families
 from ident.discovery.structure import is_inadequate
 from ident.effects.effect import Effect, PlacedEffect, Reported
@@ -289,7 +289,7 @@ def _refined_in(model: JointFit, placed: PlacedEffect) -> Effect:
     if effect.fits_rotor:
         own = own_unknowns(estimate, (placed,))
         fitted = estimate.parameters[own], estimate.parameters_std[own]
-        return refined_rotor(model.search_problem, effect, axis, *fitted)
+        return with_refined_rotor(model.search_problem, effect, axis, *fitted)
     if effect.refined:
         reduced = without_effects_of(model.search_problem, estimate, (placed,))
         return refine_together(reduced.search_problem, effect, axis)
@@ -444,7 +444,7 @@ def beside_others(
         uncertain = _uncertain_delay(finding, values, deviations, gates)
     physics = impossible(placed.effect.coefficients, values, deviations)
     if isinstance(placed.effect, SpeedFriction | PositionFriction):
-        drives = pushing(model.evidence, placed.axis)
+        drives = describe_driving_friction(model.evidence, placed.axis)
     else:
         drives = ""
     reasons = (

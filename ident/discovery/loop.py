@@ -46,7 +46,7 @@ from ident.discovery.known_mistakes import JoinedMistakes, join_mistakes
 from ident.discovery.own_settings import propose_own_settings
 from ident.discovery.resonance import gears_around, propose_resonances, refined_gear
 from ident.discovery.ripple import propose_orders
-from ident.discovery.rotor_search import propose_rotors
+from ident.discovery.rotor_search import propose_losses_without_rotor
 from ident.discovery.search import (
     EffectKey,
     Finding,
@@ -677,7 +677,7 @@ def _proposals(
     for proposed in (ripples, resonances, balancers, cables, own_settings):
         for axis, of_axis in proposed.items():
             own[axis] = (*own.get(axis, ()), *of_axis)
-    return propose_rotors(search_problem, gates, families, own)
+    return propose_losses_without_rotor(search_problem, gates, families, own)
 
 
 def _first_of_axis(aside: Sequence[SetAside], new: SetAside) -> tuple[SetAside, ...]:

@@ -26,7 +26,7 @@ from ident.discovery.candidate_fits import CandidateFit
 from ident.discovery.candidates import SearchProblem, shares_explained
 from ident.discovery.gates import Gates
 from ident.discovery.refinement import is_strictly_possible
-from ident.discovery.rotor_search import axes_with_rotor_in_load, largest_inertia
+from ident.discovery.rotor_search import axes_with_rotor_in_load, largest_rotor_inertia
 from ident.effects.effect import Effect
 from ident.effects.rotor import beside_rotor
 from ident.effects.signals import Signals, curvature
@@ -191,7 +191,7 @@ def _rotors(search_problem: SearchProblem, axis: int) -> tuple[float, ...]:
     is_known = search_problem.runs[0].rotor_inertia(axis) > 0.0
     if is_known or axis not in axes_with_rotor_in_load(search_problem.observation):
         return (0.0,)
-    largest = largest_inertia(search_problem, axis)
+    largest = largest_rotor_inertia(search_problem, axis)
     return tuple(float(f"{share * largest:.3g}") for share in ROTOR_SHARES)
 
 

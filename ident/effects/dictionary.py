@@ -1,7 +1,7 @@
 """The dictionary of effects beyond rigid links, viscous and dry friction and offset.
 
-To add an effect, look for it among the settings of the others first; a test refuses the same
-columns twice. Then:
+Before an effect is added: it may exist as a setting of another one, and a test refuses two effects
+with the same columns. Then:
 
 1. Write one class in the chapter of its physics (`friction`, `position`, `transmission`,
    `electrical`). It derives from `Effect`; its docstring states equation, sign, source and
@@ -33,7 +33,7 @@ Family = tuple[Effect, ...]
 
 
 def family(effect: Callable[..., Effect], **values: Sequence[float]) -> Family:
-    """Make an effect with every combination of values of its searched parameters.
+    """Make a family: an effect with every combination of values of its searched parameters.
 
     Args:
         effect: the class.
@@ -46,17 +46,26 @@ def family(effect: Callable[..., Effect], **values: Sequence[float]) -> Family:
     return tuple(members)
 
 
-ORDERS = (1, 2, 3, 4, 5, 6, 8, 10, 12)
-PAIRED = range(2, 13)
-"""Higher number of a pair of joints; pairs that a robot lacks are left out of its search."""
+MOTOR_ORDERS = (1, 2, 3, 4, 5, 6, 8, 10, 12)
+"""Of cogging, per motor revolution."""
+SECOND_JOINTS = range(2, 13)
+"""Number of an effect's second joint; the search leaves out pairs that a robot lacks."""
 
 LATE_S = (0.001, 0.004, 0.012, 0.05)
+"""Time constants of a late current; refinement finds the values between."""
 EARLY_S = (0.001, 0.003, 0.01)
-"""Time constants of a late current, and of an early one; those between are found by refinement."""
+"""Time constants of an early current; refinement finds the values between."""
 
-FADING_S = (20.0, 40.0, 80.0, 160.0, 320.0, 900.0)  #: Time constants of what fades after power-on
+FADING_S = (20.0, 40.0, 80.0, 160.0, 320.0, 900.0)
+"""Time constants of effects that fade after power-on."""
 CABLE_DIRECTIONS_RAD = (np.pi / 4 * np.arange(-3, 4, 2)).tolist()
-"""Directions of a slack cable over two joints: both make as much of its way, in either sense."""
+"""Directions of a slack cable over two joints: −135°, −45°, 45° and 135°.
+
+Each joint makes an equal share of its path, in the same sense or in opposite ones.
+"""
+#: Positions beyond which a hinge acts
+HINGE_STARTS_RAD = np.linspace(-2.5, 2.5, 11).tolist()
+COUNTERBALANCE_PHASES_RAD = np.linspace(-np.pi, np.pi, 6, endpoint=False).tolist()
 
 LAGS = (
     *family(electrical.Lag, filter_s=LATE_S, backwards=(0,)),
@@ -67,9 +76,6 @@ TIME_SKEWS = (
     *family(electrical.TimeSkew, filter_s=EARLY_S, backwards=(1,)),
 )
 
-HINGE_STARTS_RAD = np.linspace(-2.5, 2.5, 11).tolist()
-COUNTERBALANCE_PHASES_RAD = np.linspace(-np.pi, np.pi, 6, endpoint=False).tolist()
-
 EFFECTS: tuple[Family, ...] = (
     family(friction.Stribeck, speed_rad_s=(0.05, 0.08, 0.12, 0.2, 0.3, 0.5)),
     family(friction.NonlinearViscous, exponent=(1 / 3, 0.5, 2.0, 3.0)),
@@ -78,8 +84,10 @@ EFFECTS: tuple[Family, ...] = (
     family(position.Spring),
     family(position.PassiveSpring),
     family(friction.PositionFriction),
-    family(electrical.Cogging, order=ORDERS),
-    family(transmission.Ripple, order=(0.5,)),  # and periods of ident.discovery.ripple
+    family(electrical.Cogging, order=MOTOR_ORDERS),
+    # ident.discovery.ripple proposes more periods.
+    family(transmission.Ripple, order=(0.5,)),
+    # The form of one term, and that of two
     electrical.Saturation(two_terms=1).forms,
     family(electrical.OffsetDrift, time_constant_s=FADING_S, whole_session=(0, 1)),
     LAGS,
@@ -91,19 +99,19 @@ EFFECTS: tuple[Family, ...] = (
     family(transmission.Backlash, share=(0.02, 0.05, 0.15, 0.4)),
     family(transmission.Elasticity),
     family(transmission.Efficiency, friction_share=(0.5, 1.0)),
-    family(friction.Coupling, other_axis=PAIRED, sense=(1, -1)),
-    family(transmission.InertialCoupling, other_axis=PAIRED),
+    family(friction.Coupling, other_axis=SECOND_JOINTS, sense=(1, -1)),
+    family(transmission.InertialCoupling, other_axis=SECOND_JOINTS),
     family(position.Hinge, start_rad=HINGE_STARTS_RAD, sense=(1, -1)),
-    family(position.Cable, other_axis=PAIRED),
-    # and directions of ident.discovery.cables
-    family(position.SlackCable, other_axis=PAIRED, direction_rad=CABLE_DIRECTIONS_RAD),
+    family(position.Cable, other_axis=SECOND_JOINTS),
+    # ident.discovery.cables proposes more directions.
+    family(position.SlackCable, other_axis=SECOND_JOINTS, direction_rad=CABLE_DIRECTIONS_RAD),
     family(position.Compensator, order=(1, 2)),
-    # and geometries of ident.discovery.balancer
+    # ident.discovery.balancer proposes more geometries.
     family(position.Counterbalance, ratio=(0.2, 0.5), phase_rad=COUNTERBALANCE_PHASES_RAD),
 )
-"""One family a row, with the values of its searched parameters that the search tries.
+"""Families in the order of the search, with the values of their searched parameters that it tries.
 
-Where modules of `ident.discovery` are named, they propose more, by what fits the residual best.
+Modules of `ident.discovery` propose more values of some, by what fits the residual best.
 """
 
 GEOMETRY: tuple[Family, ...] = (
@@ -111,11 +119,13 @@ GEOMETRY: tuple[Family, ...] = (
     family(geometry_corrections.GravityDirection),
     family(geometry_corrections.LatePosition),
 )
-"""What the description may have wrong: effects that correct it (`geometry_corrections`)."""
+"""Effects that correct the geometry of the robot's description (`geometry_corrections`)."""
 
 SMOOTH_VARIABLES = tuple(
     variable for variable in Abscissa if variable is not Abscissa.OTHER_ACCELERATION
 )
-"""Variables of a smooth term; what follows the acceleration of another joint is its inertia."""
-UNNAMED: Family = (Periodic(), *(Smooth(variable) for variable in SMOOTH_VARIABLES))
-"""Terms that fit anything: for structure in a residual that no name explains."""
+"""Variables of a smooth term; one of another joint's acceleration is inertial coupling."""
+SMOOTH_TERMS = tuple(Smooth(variable) for variable in SMOOTH_VARIABLES)
+
+UNNAMED: Family = (Periodic(), *SMOOTH_TERMS)
+"""Terms that fit anything, for structure in a residual that no named effect explains."""

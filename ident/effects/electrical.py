@@ -1,6 +1,4 @@
-"""The motor and its current: less torque at large current, torque ripple, offsets that drift,
-and late currents.
-"""
+"""Effects of the motor and its current: saturation, cogging, drift of the offset, late currents."""
 
 from __future__ import annotations
 
@@ -16,22 +14,22 @@ from ident.effects.signals import Abscissa, Signals
 from ident.model.model import Column
 from ident.model.regressor import cos_sin
 
+#: By how much a current may be early on one axis. The reference precedes the torque by the delay of
+#: the current loop, and a position is read a few cycles late. Both are milliseconds: a current that
+#: is earlier than this does not cause the torque.
 EARLIEST_S = 0.01
-"""By how much a current may be early on one axis: its reference precedes the torque by the current
-loop, and a position is read a few cycles late; both are milliseconds. More is no cause of what was
-recorded before it.
-"""
 
 
 @dataclass(frozen=True, slots=True)
 class Saturation(Effect):
     """τ = c · g v³ + d · g v⁵: at large torque the motor needs more current v than its gain g says.
 
-    v is the current that the model predicts. Where half the torque constant is left at a current h,
-    i/(1 + (i/h)²) = v, c is about 1/h² and d about 2/h⁴ (the series converges below v = h/2). With
-    the first term alone the gain takes up what is left of the others. Source: saturation of the
-    stator iron, the first even terms of the current per torque; Hendershot & Miller, Design of
-    Brushless Permanent-Magnet Motors. Signature: large current, odd in it.
+    v is the current that the model predicts, i the recorded one. With a torque constant that falls
+    by 1/(1 + (i/h)²), to a half at i = h, v = i/(1 + (i/h)²). Its inverse is the series
+    i = v + v³/h² + 2 v⁵/h⁴ + …, which converges below v = h/2: c is about 1/h², d about 2/h⁴. With
+    the first term alone, the gain compensates the others in part. Source: saturation of the stator
+    iron; Hendershot & Miller, Design of Brushless Permanent-Magnet Motors. Signature: large
+    current, odd in it.
     """
 
     name = "saturation"
@@ -54,15 +52,19 @@ class Saturation(Effect):
 
     @property
     def forms(self) -> tuple[Saturation, ...]:
-        """That of one term, then that of two if it has them."""
-        return tuple(Saturation(two_terms) for two_terms in range(1 + self.two_terms))
+        """The form with one term, then the form with two if this one has two."""
+        if self.two_terms:
+            return (Saturation(0), Saturation(1))
+        return (Saturation(0),)
 
     def columns(self, signals: Signals, axis: int) -> FloatArray:
-        """Columns, shape (1 or 2, k)."""
+        """Columns g v³ and g v⁵ as g v times even powers of v, shape (1 or 2, k)."""
         square = signals.current_a[axis] ** 2
-        return np.asarray(
-            signals.motor_torque_nm[axis] * np.stack((square, square**2)[: 1 + self.two_terms])
-        )
+        even_powers = [square]
+        if self.two_terms:
+            even_powers.append(square**2)
+        torque_nm = signals.motor_torque_nm[axis]
+        return np.asarray(torque_nm * np.stack(even_powers))
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,13 +88,14 @@ class Cogging(Effect):
 
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Columns, shape (2, k)."""
-        return np.stack(cos_sin(self.order * signals.motor_position_rad[axis]))
+        motor_angle = signals.motor_position_rad[axis]
+        return np.stack(cos_sin(self.order * motor_angle))
 
 
 @dataclass(frozen=True, slots=True)
 class OffsetDrift(FadingEffect):
     """τ = c · e^(−t/η), at the motor;  c > 0:
-    the reference is too high by c/g at first, beside the declared offset.
+    at power-on the reference is higher by c/g than the declared offset says.
 
     Source: the offset of a current sensor drifts with its temperature, which settles with one time
     constant after power-on. Signature: time, at any speed.
@@ -121,11 +124,13 @@ class LateCurrent(Effect):
     added_settings = ("filter_s", "backwards")
 
     filter_s: Annotated[float, Range(0.0, 0.1)] = 0.0  #: T
-    backwards: Switch = 0  #: 1 where the filter runs backwards in time, else 0
+    #: 1 where the filter runs backwards in time, else 0
+    backwards: Switch = 0
 
     def rate(self, torque_nm: FloatArray, rate_hz: float) -> FloatArray:
-        """ẏ of a torque [Nm/s], of its shape."""
-        return filtered_rate(torque_nm, rate_hz, self.filter_s, backwards=bool(self.backwards))
+        """Return `filtered_rate` of a torque [Nm/s], an array of the same shape."""
+        backwards = bool(self.backwards)
+        return filtered_rate(torque_nm, rate_hz, self.filter_s, backwards=backwards)
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,11 +138,11 @@ class Lag(LateCurrent):
     """τ = −c · ẏ,  T ẏ + y = g v;  c > 0: the current is late by c; c < 0:
     it is early, by 10 ms at most.
 
-    v is the current that the model predicts, other effects left out. A first-order lag of time
-    constant c is this with T = c; a delay is v(t − c) ≈ v − c v̇ + c²/2 · v̈, this with T = c/2 to
-    second order. For an early current the filter runs backwards in time. With T = 0 it is the first
-    order alone, which is wrong where the torque jumps, and bends the gain. Source: Taylor and Padé
-    expansions of a delay. Signature: rate of torque.
+    v is the current that the model predicts, without other effects. c is fitted; T is a setting,
+    which the search chooses. T = c is a first-order lag with the time constant c. T = c/2 is a
+    delay to second order: v(t − c) ≈ v − c v̇ + c²/2 · v̈. T = 0 is the first order alone; it is
+    wrong where the torque jumps, and biases the gain. For an early current the filter runs
+    backwards in time. Source: Taylor and Padé expansions of a delay. Signature: rate of torque.
     """
 
     name = "lag"
@@ -154,9 +159,8 @@ class Lag(LateCurrent):
 class TimeSkew(LateCurrent):
     """τ_i = −c · ẏ_i,  T ẏ_i + y_i = g_i v_i, of every motor i;  c > 0: all currents are late by c.
 
-    On one axis a delay is a `Lag` (see there for T); the same delay on all axes is a fault of the
-    recording. Source: Padé expansion of a delay. Signature: rate of torque, the same time
-    everywhere.
+    A `Lag` (see there for T) with the same delay on every axis, which is a fault of the recording.
+    Source: Padé expansion of a delay. Signature: rate of torque, the same time on every axis.
     """
 
     name = "time-skew"
@@ -172,32 +176,49 @@ class TimeSkew(LateCurrent):
 def filtered_rate(
     torque_nm: FloatArray, rate_hz: float, filter_s: float, *, backwards: bool
 ) -> FloatArray:
-    """ẏ of T ẏ + y = τ [Nm/s], exact for torques that are linear between samples;
-    of the shape of ``torque_nm``.
+    """Return ẏ of the first-order filter T ẏ + y = τ [Nm/s], of the shape of ``torque_nm``.
 
-    It starts as if the first torque had been there for ever. With T = 0, ẏ is the central
-    difference of τ.
+    It is exact for torques that are linear between samples (first-order hold), and starts as if the
+    first torque had acted for ever. With T = 0, ẏ is the central difference of τ.
 
     Args:
         torque_nm: τ, shape (k,) or (n, k).
         rate_hz: sampling rate.
         filter_s: T.
-        backwards: the filter runs from the last sample to the first.
+        backwards: whether the filter runs from the last sample to the first.
     """
     if backwards:
-        return -filtered_rate(torque_nm[..., ::-1], rate_hz, filter_s, backwards=False)[..., ::-1]
+        # Reversed time turns the sign of the derivative.
+        reverse_nm = torque_nm[..., ::-1]
+        reverse_rate = filtered_rate(reverse_nm, rate_hz, filter_s, backwards=False)
+        return -reverse_rate[..., ::-1]
     if not filter_s > 0.0:
         return np.asarray(np.gradient(torque_nm, axis=-1) * rate_hz)
-    steps = filter_s * rate_hz
-    kept = np.exp(-1.0 / steps)
-    new = 1.0 - (1.0 - kept) * steps
-    old = (1.0 - kept) * steps - kept
-    # y_k − kept · y_k−1 = new · τ_k + old · τ_k−1 is a triangular system with two bands.
-    band = np.full((2, torque_nm.shape[-1]), -kept, order="F")
-    driven = new * torque_nm
-    driven[..., 1:] += old * torque_nm[..., :-1]
-    driven[..., 0] = torque_nm[..., 0]
-    passed = lapack.dtbtrs(band, np.atleast_2d(driven).T, uplo="L", diag="U")[0].T.reshape(
-        torque_nm.shape
-    )
-    return np.asarray((torque_nm - passed) / filter_s)
+    filtered_nm = _low_passed(torque_nm, filter_s * rate_hz)
+    return np.asarray((torque_nm - filtered_nm) / filter_s)
+
+
+def _low_passed(torque_nm: FloatArray, constant_samples: float) -> FloatArray:
+    """y of T ẏ + y = τ for a τ that is linear between samples, of the shape of ``torque_nm``.
+
+    With N = T in samples, p = e^(−1/N), a = 1 − (1 − p) N and b = (1 − p) N − p, it is
+
+        y_0 = τ_0,   y_k − p y_k−1 = a τ_k + b τ_k−1,
+
+    a triangular system with two bands.
+
+    Args:
+        torque_nm: τ, shape (k,) or (n, k).
+        constant_samples: N.
+    """
+    pole = np.exp(-1.0 / constant_samples)
+    present_weight = 1.0 - (1.0 - pole) * constant_samples
+    previous_weight = (1.0 - pole) * constant_samples - pole
+    # With diag="U" the first row, that of the diagonal, is taken for one.
+    bands = np.full((2, torque_nm.shape[-1]), -pole, order="F")
+    right_side = present_weight * torque_nm
+    right_side[..., 1:] += previous_weight * torque_nm[..., :-1]
+    right_side[..., 0] = torque_nm[..., 0]
+    columns = np.atleast_2d(right_side).T
+    filtered, _ = lapack.dtbtrs(bands, columns, uplo="L", diag="U")
+    return np.asarray(filtered.T.reshape(torque_nm.shape))

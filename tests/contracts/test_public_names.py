@@ -18,7 +18,7 @@ import ident
 OPAQUE = {
     "Arm": "part of `Signals` for effects of the description",
     "Assembly": "of a model; nobody makes one",
-    "Demands": "of an evidence, for instruments",
+    "DemandCache": "of an evidence, for instruments",
     "HeldChannels": "of a dataset, for diagnoses",
     "JudgedChannels": "of a run that was read, for whoever differentiates it",
     "Observation": "rows of an evidence",

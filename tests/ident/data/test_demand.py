@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ident.data.conditioning import Conditioning
 from ident.data.dataset import Dataset, differentiate
-from ident.data.demand import Demands, as_demanded, demanded_positions, with_demand
+from ident.data.demand import DemandCache, as_demanded, demanded_positions, with_demand
 from ident.data.run import Run
 from ident.effects.effect import PlacedEffect
 from ident.effects.geometry_corrections import LatePosition, corrected_dataset
@@ -144,11 +144,13 @@ def test_what_corrects_a_run_corrects_its_demand() -> None:
 
 
 def test_the_demand_of_a_run_is_rebuilt_once() -> None:
-    demands, (one, other) = Demands(), (dataset(two_motors(5)), dataset(two_motors(6)))
-    first = demands.of(one, STRAIGHT)
-    assert demands.of(one, STRAIGHT) is first
+    cache = DemandCache()
+    one = dataset(two_motors(5))
+    other = dataset(two_motors(6))
+    first = cache.positions(one, STRAIGHT)
+    assert cache.positions(one, STRAIGHT) is first
     assert first is not None
     again = demanded_positions(one, STRAIGHT)
     assert again is not None
     assert np.array_equal(first, again)
-    assert demands.of(other, STRAIGHT) is not first
+    assert cache.positions(other, STRAIGHT) is not first

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from daq.config.cell import model_of
 from ident.data.dataset import differentiate
-from ident.data.held import fill_held, held_samples, without_held
+from ident.data.held import fill_channel, fill_held, held_samples
 from ident.data.run import Run
 from ident.estimators.identify import identify
 from tests.ident.mistaken import AXES, SMALL, diagnosed, small_recordings
@@ -55,8 +55,8 @@ def stale(values: FloatArray, samples: int) -> FloatArray:
 def test_a_held_motion_is_filled_in(seed: int, samples: int, count: float) -> None:
     motion = waves(seed)
     read = counted(motion, count) if count else motion
-    channel = without_held(stale(read, samples), RATE_HZ, smooth=True)
-    assert channel.share == pytest.approx(1.0 - 1.0 / samples, abs=0.03)
+    channel = fill_channel(stale(read, samples), RATE_HZ, by_spline=True)
+    assert channel.held_share == pytest.approx(1.0 - 1.0 / samples, abs=0.03)
     assert channel.hold_s == pytest.approx(samples / RATE_HZ)
     inside = slice(50, -50)
     channel_difference = np.abs(channel.values - motion)
@@ -71,7 +71,7 @@ def test_a_held_motion_is_filled_in(seed: int, samples: int, count: float) -> No
 @settings(max_examples=25, deadline=None)
 def test_a_coarse_encoder_holds_nothing(seed: int, count: float) -> None:
     read = counted(waves(seed), count)
-    assert without_held(read, RATE_HZ, smooth=True).values is read
+    assert fill_channel(read, RATE_HZ, by_spline=True).values is read
 
 
 @pytest.mark.parametrize("rest_s", [0.02, 0.2, 1.0])
@@ -80,7 +80,7 @@ def test_a_joint_that_rests_between_moves_holds_nothing(rest_s: float) -> None:
     smooth = ramp**3 * (10.0 - 15.0 * ramp + 6.0 * ramp**2)
     steps = np.floor(TIME_S / (0.5 + rest_s))
     motion = counted(steps + smooth, COUNT_RAD)
-    assert without_held(motion, RATE_HZ, smooth=True).values is motion
+    assert fill_channel(motion, RATE_HZ, by_spline=True).values is motion
 
 
 @pytest.mark.parametrize("noise_counts", [0.3, 1.0, 3.0, 30.0])
@@ -89,13 +89,13 @@ def test_a_noisy_current_holds_nothing(noise_counts: float) -> None:
     for count in (0.01, 0.05):
         noise = noise_counts * count * rng.standard_normal(len(TIME_S))
         current = counted(waves(2) + noise, count)
-        assert without_held(current, RATE_HZ, smooth=False).values is current
+        assert fill_channel(current, RATE_HZ, by_spline=False).values is current
 
 
 def test_what_was_read_stays_what_it_was() -> None:
     read = stale(waves(3), 8)
     held = held_samples(read, RATE_HZ)
-    filled = without_held(read, RATE_HZ, smooth=True).values
+    filled = fill_channel(read, RATE_HZ, by_spline=True).values
     assert np.array_equal(filled[~held], read[~held])
 
 

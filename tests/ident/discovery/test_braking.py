@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from ident.data.dataset import Dataset
-from ident.discovery.braking import pushing
+from ident.discovery.braking import describe_driving_friction
 from ident.discovery.evidence import Evidence, with_effects
 from ident.discovery.gates import Gates
 from ident.discovery.joining import SetAside
@@ -90,11 +90,11 @@ def test_terms_that_push_together_at_low_speed_are_named_with_speed_and_size(
     effect = NonlinearViscous(1.0 / 3.0)
     placed = PlacedEffect(effect, AXIS)
     fitted = with_effects(worn, (placed,))
-    said = pushing(fitted, AXIS)
+    said = describe_driving_friction(fitted, AXIS)
     assert said.startswith("the friction of this axis would push the arm at rest (-1")
     assert said.endswith(" Nm)")
-    assert pushing(fitted, 0) == ""
-    assert pushing(clean, AXIS) == ""
+    assert describe_driving_friction(fitted, 0) == ""
+    assert describe_driving_friction(clean, AXIS) == ""
 
 
 def test_the_search_writes_no_friction_that_drives_the_arm(clean: Evidence, truth: Truth) -> None:
@@ -102,7 +102,7 @@ def test_the_search_writes_no_friction_that_drives_the_arm(clean: Evidence, trut
     rng = np.random.default_rng(0)
     steps = find_effects(worn, rng, GATES)
     end = steps[-1].after
-    assert all(pushing(end, axis) == "" for axis in range(3))
+    assert all(describe_driving_friction(end, axis) == "" for axis in range(3))
     aside: list[SetAside] = []
     for step in steps:
         aside.extend(step.set_aside)
@@ -126,7 +126,7 @@ def test_friction_that_brakes_is_still_found(
     end = effects[-1].after
     expected = [(effect.name, AXIS)]
     assert [(placed.effect.name, placed.axis) for placed in end.effects] == expected
-    assert pushing(end, AXIS) == ""
+    assert describe_driving_friction(end, AXIS) == ""
 
 
 def test_a_direction_in_which_the_arm_would_be_driven_is_seen(
@@ -140,7 +140,9 @@ def test_a_direction_in_which_the_arm_would_be_driven_is_seen(
         parameters[index] = value
         estimate = replace(fitted.estimate, parameters=parameters)
         lopsided = replace(fitted, estimate=estimate)
-        found = re.search(r"would push the arm at (-?[0-9.]+) rad/s", pushing(lopsided, AXIS))
+        found = re.search(
+            r"would push the arm at (-?[0-9.]+) rad/s", describe_driving_friction(lopsided, AXIS)
+        )
         assert found is not None
         assert (float(found[1]) < 0.0) == (value > 0.0)
 
@@ -179,13 +181,13 @@ def test_friction_with_a_payload_is_judged_by_itself(truth: Truth) -> None:
     ]
     effects = (PlacedEffect(Stribeck(0.3), AXIS),)
     fitted = with_effects(gathered(by_payload, tuple(runs)), effects)
-    assert pushing(fitted, AXIS) == ""
+    assert describe_driving_friction(fitted, AXIS) == ""
     names = [column.name for column in fitted.estimate.unknowns]
     parameters = fitted.estimate.parameters.copy()
     parameters[names.index("fs2_loaded")] -= 30.0
     estimate = replace(fitted.estimate, parameters=parameters)
     lighter = replace(fitted, estimate=estimate)
-    assert "would push the arm" in pushing(lighter, AXIS)
+    assert "would push the arm" in describe_driving_friction(lighter, AXIS)
 
 
 def _with_swing(clean: Evidence, truth: Truth, swing_nm: float, offset_nm: float) -> Evidence:
@@ -206,11 +208,11 @@ def test_friction_that_pushes_at_a_position_is_named_with_that_position(
     # 25 Nm of a cosine on a dry friction of less: half a turn from zero it would push.
     worn = _with_swing(clean, truth, 25.0, -10.0)
     fitted = with_effects(worn, (PlacedEffect(PositionFriction(), AXIS),))
-    said = pushing(fitted, AXIS)
+    said = describe_driving_friction(fitted, AXIS)
     assert said.startswith("the friction of this axis would push the arm at rest, where its")
     position_rad = float(re.findall(r"position is (-?[\d.]+) rad", said)[0])
     assert np.cos(position_rad) < 0.0
-    assert pushing(fitted, 0) == ""
+    assert describe_driving_friction(fitted, 0) == ""
 
 
 def test_friction_that_brakes_at_every_position_may_depend_on_it(
@@ -218,7 +220,7 @@ def test_friction_that_brakes_at_every_position_may_depend_on_it(
 ) -> None:
     worn = _with_swing(clean, truth, 4.0, 4.0)
     fitted = with_effects(worn, (PlacedEffect(PositionFriction(), AXIS),))
-    assert pushing(fitted, AXIS) == ""
+    assert describe_driving_friction(fitted, AXIS) == ""
 
 
 def test_the_search_writes_no_friction_of_the_position_that_drives_the_arm(
@@ -227,5 +229,5 @@ def test_the_search_writes_no_friction_of_the_position_that_drives_the_arm(
     worn = _with_swing(clean, truth, 25.0, -10.0)
     steps = find_effects(worn, np.random.default_rng(0), GATES)
     end = steps[-1].after
-    assert all(pushing(end, axis) == "" for axis in range(3))
+    assert all(describe_driving_friction(end, axis) == "" for axis in range(3))
     assert all(placed.effect.name != "position-friction" for placed in end.effects)

@@ -14,7 +14,11 @@ from ident.discovery.declared import with_declared
 from ident.discovery.evidence import Evidence, gather, with_effects
 from ident.discovery.gates import Gates
 from ident.discovery.loop import find_effects
-from ident.discovery.rotor_search import axes_with_rotor_in_load, largest_inertia, refined_rotor
+from ident.discovery.rotor_search import (
+    axes_with_rotor_in_load,
+    largest_rotor_inertia,
+    with_refined_rotor,
+)
 from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import Effect, PlacedEffect
 from ident.effects.friction import LoadFriction
@@ -229,7 +233,7 @@ def test_only_the_first_two_axes_of_an_arm_carry_their_rotors(heavy: Evidence) -
     assert axes_with_rotor_in_load(heavy.training) == (0, 1)
     problem = search_problem_of(heavy)
     for axis in (0, 1):
-        assert largest_inertia(problem, axis) > 0.9 * ROTORS_KG_M2[axis]
+        assert largest_rotor_inertia(problem, axis) > 0.9 * ROTORS_KG_M2[axis]
 
 
 def test_the_bound_of_a_rotor_holds_for_a_redundant_drive() -> None:
@@ -250,7 +254,7 @@ def test_the_bound_of_a_rotor_holds_for_a_redundant_drive() -> None:
     alone = replace(problem, runs=runs)
     smallest_inertia_kg_m2 = np.min(inertia_kg_m2[0, 0])
     assert smallest_inertia_kg_m2 < rotors_kg_m2[0]
-    assert largest_inertia(alone, 0) >= rotors_kg_m2[0] - 1e-9
+    assert largest_rotor_inertia(alone, 0) >= rotors_kg_m2[0] - 1e-9
 
 
 def _declared(heavy: Evidence, effect: Effect, axis: int) -> Evidence:
@@ -295,7 +299,7 @@ def test_no_rotor_has_a_negative_inertia(name: str, heavy: Evidence) -> None:
     problem = search_problem_of(heavy)
     deviations = np.array([0.01, 0.01])
     coefficients = np.array([0.1, -0.05])
-    certain = refined_rotor(problem, without, 0, coefficients, deviations)
+    certain = with_refined_rotor(problem, without, 0, coefficients, deviations)
     assert certain.settings["with_rotor"] == 0
-    may_be_zero = refined_rotor(problem, without, 0, np.array([0.1, -0.015]), deviations)
+    may_be_zero = with_refined_rotor(problem, without, 0, np.array([0.1, -0.015]), deviations)
     assert may_be_zero == without

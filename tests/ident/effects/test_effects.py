@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from ident.discovery.structure import VARIABLES
-from ident.effects.dictionary import EFFECTS, GEOMETRY, PAIRED
+from ident.effects.dictionary import EFFECTS, GEOMETRY, SECOND_JOINTS
 from ident.effects.effect import Effect, GearSide, PlacedEffect, Property, at_joints, is_placeable
 from ident.effects.electrical import Cogging, Lag, Saturation, TimeSkew
 from ident.effects.friction import (
@@ -376,7 +376,7 @@ def _duplicates(families: tuple[tuple[Effect, ...], ...]) -> list[tuple[str, str
 
 @pytest.mark.slow
 def test_no_two_effects_are_the_same_under_two_names() -> None:
-    of_one_joint = [("spring ()", f"cable ({other})") for other in PAIRED]
+    of_one_joint = [("spring ()", f"cable ({other})") for other in SECOND_JOINTS]
     forms = [("saturation (0)", "saturation (1)")]  # with one term and with two
     assert _duplicates(EFFECTS) == [*of_one_joint, *forms]
     same = [("nonlinear-viscous (3)", "cubic ()")]
