@@ -49,6 +49,9 @@ FloatArray = NDArray[np.float64]
 PAUSE_S = 40.0
 """From the start of one run to that of the next."""
 GATES = Gates(draws=199)
+J3 = 2
+"""Axis of the small arm that a coupling or a cable joins to the axis of its case."""
+EFFICIENCY = 0.85
 
 
 @dataclass(frozen=True)
@@ -66,7 +69,7 @@ class TrueSignals:
     time_s: FloatArray
     started_s: float
     rate_hz: float
-    pulls: Callable[[int], FloatArray]
+    inertia_columns: Callable[[int], FloatArray]
     temperatures: FloatArray
 
     @property
@@ -94,14 +97,17 @@ class TrueSignals:
         """Motor angle of the axis."""
         return np.asarray(self.motor_angles[self.axis])
 
-    def pull(self) -> FloatArray:
+    def inertia_column(self) -> FloatArray:
         """Torque of every joint per unit of acceleration of the axis, at every sample."""
-        return self.pulls(self.axis)
+        return self.inertia_columns(self.axis)
 
-    def accelerated(self, of_time: FloatArray) -> FloatArray:
-        """Second derivative."""
+    def second_derivative(self, of_time: FloatArray) -> FloatArray:
+        """Second derivative by central differences; the ends repeat their neighbours."""
         step = 1.0 / self.rate_hz
-        middle = (of_time[2:] - 2.0 * of_time[1:-1] + of_time[:-2]) / step**2
+        after = of_time[2:]
+        here = of_time[1:-1]
+        before = of_time[:-2]
+        middle = (after - 2.0 * here + before) / step**2
         return np.concatenate((middle[:1], middle, middle[-1:]))
 
 
@@ -118,112 +124,49 @@ class Planted:
     expected: tuple[float, ...]
 
 
-def _bristle(t: TrueSignals, distance_rad: float) -> FloatArray:
-    """z of Dahl's model, sample by sample:
-    dz = (1 − z s) dq/η with the exact solution over one step.
+def _spring(t: TrueSignals) -> FloatArray:
+    return 9.0 * t.position
+
+
+def _cogging(t: TrueSignals) -> FloatArray:
+    """Once a turn of the motor."""
+    return _wave(t.motor_angle)
+
+
+def _ripple(t: TrueSignals) -> FloatArray:
+    """Once every second turn of the motor."""
+    half_angle = 0.5 * t.motor_angle
+    return _wave(half_angle)
+
+
+def _wave(angle: FloatArray) -> FloatArray:
+    cosine = 4.0 * np.cos(angle)
+    sine = 3.0 * np.sin(angle)
+    return np.asarray(cosine + sine)
+
+
+def _saturation(t: TrueSignals) -> FloatArray:
+    return _torque_lost_by_saturation(t, half_a=10.0)
+
+
+def _torque_lost_by_saturation(t: TrueSignals, half_a: float) -> FloatArray:
+    """Gain times the current that a torque needs where half the torque constant is left at half_a,
+    i / (1 + (i/h)²), less that torque.
     """
-    z = 0.0
-    out = np.empty_like(t.velocity)
-    for k, step in enumerate(t.velocity / t.rate_hz):
-        way = np.sign(step)
-        z = way - (way - z) * np.exp(-abs(step) / distance_rad)
-        out[k] = z
-    return np.asarray(out)
+    gain = GAINS[t.axis]
+    least_a = t.motor_torque / gain
+    root = np.sqrt(1.0 - 4.0 * (least_a / half_a) ** 2)
+    saturated = gain * 2.0 * least_a / (1.0 + root)
+    return np.asarray(saturated - t.motor_torque)
 
 
-def _meshed(t: TrueSignals, efficiency: float) -> FloatArray:
-    """More torque where the motor drives the load, less where the load drives it:
-    what a gear keeps of the power.
-    """
-    through = t.load + t.frictions[t.axis]
-    difference = (
-        np.where(through * t.velocity > 0.0, through / efficiency, through * efficiency) - through
-    )
-    return np.asarray(difference)
+def _lag(t: TrueSignals) -> FloatArray:
+    followed = _first_order_lag(t.motor_torque, 0.01, t.rate_hz)
+    return followed - t.motor_torque
 
 
-def _pushed(t: TrueSignals, half_gap_rad: float) -> FloatArray:
-    """Torque of all joints for the joint behind a gap,
-    which follows its motor from flank to flank.
-    """
-    through = t.load + t.frictions[t.axis]
-    rms_through = np.sqrt(np.mean(through**2))
-    width = 0.15 * rms_through
-    flank = 1.0 - 2.0 / (1.0 + np.exp(2.0 * through / width))
-    return np.asarray(-half_gap_rad * t.pull() * t.accelerated(flank))
-
-
-def _between(t: TrueSignals, other: int, along: FloatArray) -> FloatArray:
-    """The same friction on two joints."""
-    torque = np.zeros_like(t.positions)
-    torque[[t.axis, other]] = along
-    return torque
-
-
-def _rubbing(t: TrueSignals, other: int) -> FloatArray:
-    both = t.velocities[t.axis] + t.velocities[other]
-    along = 2.0 * np.sign(both) + 0.8 * both
-    return _between(t, other, along)
-
-
-def _inertial(t: TrueSignals, other: int) -> FloatArray:
-    torque = np.zeros_like(t.positions)
-    torque[t.axis], torque[other] = 0.25 * t.accelerations[other], 0.25 * t.accelerations[t.axis]
-    return torque
-
-
-def _hose(t: TrueSignals, other: int) -> FloatArray:
-    """A hose of 30 Nm/rad whose way is 0.8 q_i − 0.6 q_j, which pulls and pushes."""
-    force = 30.0 * (0.8 * t.positions[t.axis] - 0.6 * t.positions[other])
-    torque = np.zeros_like(t.positions)
-    torque[t.axis], torque[other] = 0.8 * force, -0.6 * force
-    return torque
-
-
-def _slack_cable(t: TrueSignals, other: int) -> FloatArray:
-    """A cable that pulls where the joint is before the other one, around both at one radius;
-    half of it on each.
-    """
-    position_difference = t.positions[t.axis] - t.positions[other]
-    force = np.where(t.positions[t.axis] > t.positions[other], position_difference, 0.0)
-    torque = np.zeros_like(t.positions)
-    torque[t.axis], torque[other] = 15.0 * force, -15.0 * force
-    return torque
-
-
-def _lengthening(angle: FloatArray, foot_m: float, lever_m: float, force_n: float) -> FloatArray:
-    """A constant force along a balancer: its work F Δs between neighbouring angles,
-    over their difference.
-    """
-    ends = [np.array([np.cos(angle + way), np.sin(angle + way)]) * lever_m for way in (-1e-6, 1e-6)]
-    shorter, longer = (np.hypot(foot_m - x, y) for x, y in ends)
-    return np.asarray(force_n * (longer - shorter) / 2e-6)
-
-
-def _cold(t: TrueSignals, clock_s: FloatArray, constant_s: float) -> FloatArray:
-    velocity_sign = np.sign(t.velocity)
-    return np.asarray(
-        np.exp2(-clock_s / (constant_s * np.log(2.0))) * (5.0 * velocity_sign + 2.0 * t.velocity)
-    )
-
-
-def _heated(t: TrueSignals) -> FloatArray:
-    """Dry friction that grows with temperature, and viscous friction that falls."""
-    above_k = t.temperatures[t.axis] - 40.0
-    velocity_sign = np.sign(t.velocity)
-    return np.asarray(above_k * (0.15 * velocity_sign - 0.1 * t.velocity))
-
-
-def _saturated(torque: FloatArray, gain: float, half_a: float) -> FloatArray:
-    """Gain times the current that a torque needs where half the torque constant is left at half_a:
-    i / (1 + (i/h)²).
-    """
-    least_a = torque / gain
-    return np.asarray(gain * 2.0 * least_a / (1.0 + np.sqrt(1.0 - 4.0 * (least_a / half_a) ** 2)))
-
-
-def _followed(torque: FloatArray, constant_s: float, rate_hz: float) -> FloatArray:
-    """What a first-order lag makes of it, in ten Euler steps a sample,
+def _first_order_lag(torque: FloatArray, constant_s: float, rate_hz: float) -> FloatArray:
+    """Torque behind a first-order lag, in ten Euler steps a sample,
     between which it goes straight.
     """
     out = np.empty_like(torque)
@@ -234,46 +177,247 @@ def _followed(torque: FloatArray, constant_s: float, rate_hz: float) -> FloatArr
         for step in range(steps):
             asked = before + (value - before) * (step + 0.5) / steps
             state += (asked - state) / (constant_s * rate_hz * steps)
-        out[sample], before = state, value
+        out[sample] = state
+        before = value
     return out
 
 
-def _late(torques: FloatArray, delay_s: float, rate_hz: float) -> FloatArray:
-    time_s = np.arange(torques.shape[1]) / rate_hz
-    return np.stack([np.interp(time_s - delay_s, time_s, torque) for torque in torques])
+def _time_skew(t: TrueSignals) -> FloatArray:
+    """Current of every axis recorded 8 ms late."""
+    time_s = np.arange(t.motor_torques.shape[1]) / t.rate_hz
+    asked_s = time_s - 0.008
+    late = [np.interp(asked_s, time_s, torque) for torque in t.motor_torques]
+    return np.stack(late) - t.motor_torques
+
+
+def _stribeck(t: TrueSignals) -> FloatArray:
+    speed = np.abs(t.velocity)
+    growth = np.exp(speed / 0.2)
+    return np.asarray(6.0 * np.sign(t.velocity) / growth)
+
+
+def _nonlinear_viscous(t: TrueSignals) -> FloatArray:
+    speed = np.abs(t.velocity)
+    return np.asarray(1.5 * t.velocity * speed)
+
+
+def _asymmetric_viscous(t: TrueSignals) -> FloatArray:
+    speed = np.maximum(t.velocity, -t.velocity)
+    return np.asarray(0.9 * speed)
+
+
+def _load_friction(t: TrueSignals) -> FloatArray:
+    return _friction_by_load(t, 0.15)
+
+
+def _friction_by_load(t: TrueSignals, share: float) -> FloatArray:
+    absolute_load = np.abs(t.load)
+    return np.asarray(share * absolute_load * np.sign(t.velocity))
+
+
+def _position_friction(t: TrueSignals) -> FloatArray:
+    by_position = np.cos(t.position + 0.7)
+    return np.asarray(np.sign(t.velocity) * 1.5 * by_position)
+
+
+def _warm_up_of_a_run(t: TrueSignals) -> FloatArray:
+    return _cold_friction(t, t.time_s, constant_s=20.0)
+
+
+def _warm_up_of_a_session(t: TrueSignals) -> FloatArray:
+    session_s = t.started_s + t.time_s
+    return _cold_friction(t, session_s, constant_s=80.0)
+
+
+def _cold_friction(t: TrueSignals, clock_s: FloatArray, constant_s: float) -> FloatArray:
+    """Friction that falls with time, as exp(-clock/constant)."""
+    half_life_s = constant_s * np.log(2.0)
+    left = np.exp2(-clock_s / half_life_s)
+    dry = 5.0 * np.sign(t.velocity)
+    viscous = 2.0 * t.velocity
+    return np.asarray(left * (dry + viscous))
+
+
+def _temperature_friction(t: TrueSignals) -> FloatArray:
+    """Dry friction that grows with temperature, and viscous friction that falls."""
+    above_k = t.temperatures[t.axis] - 40.0
+    dry = 0.15 * np.sign(t.velocity)
+    viscous = 0.1 * t.velocity
+    return np.asarray(above_k * (dry - viscous))
+
+
+def _presliding(t: TrueSignals) -> FloatArray:
+    bristle = _bristle(t, 0.08)
+    return np.asarray(9.0 * (bristle - np.sign(t.velocity)))
+
+
+def _bristle(t: TrueSignals, distance_rad: float) -> FloatArray:
+    """z of Dahl's model, sample by sample:
+    dz = (1 − z s) dq/η with the exact solution over one step.
+    """
+    z = 0.0
+    out = np.empty_like(t.velocity)
+    step_rad = t.velocity / t.rate_hz
+    for k, step in enumerate(step_rad):
+        way = np.sign(step)
+        left = np.exp(-abs(step) / distance_rad)
+        z = way - (way - z) * left
+        out[k] = z
+    return np.asarray(out)
+
+
+def _backlash(t: TrueSignals) -> FloatArray:
+    """Torque of all joints for the joint behind a gap of 2 × 4 mrad,
+    which follows its motor from flank to flank.
+    """
+    half_gap_rad = 0.004
+    through = _torque_through_the_gear(t)
+    rms_through = np.sqrt(np.mean(through**2))
+    width = 0.15 * rms_through
+    growth = np.exp(2.0 * through / width)
+    flank = 1.0 - 2.0 / (1.0 + growth)
+    flank_acceleration = t.second_derivative(flank)
+    return np.asarray(-half_gap_rad * t.inertia_column() * flank_acceleration)
+
+
+def _torque_through_the_gear(t: TrueSignals) -> FloatArray:
+    return np.asarray(t.load + t.frictions[t.axis])
+
+
+def _elasticity(t: TrueSignals) -> FloatArray:
+    """A gear of 2000 Nm/rad."""
+    load_acceleration = t.second_derivative(t.load)
+    return np.asarray(-0.0005 * t.inertia_column() * load_acceleration)
+
+
+def _efficiency(t: TrueSignals) -> FloatArray:
+    """More torque where the motor drives the load, less where the load drives it:
+    what a gear keeps of the power.
+    """
+    through = _torque_through_the_gear(t)
+    power = through * t.velocity
+    needed = through / EFFICIENCY
+    left = through * EFFICIENCY
+    motor_torque = np.where(power > 0.0, needed, left)
+    return np.asarray(motor_torque - through)
+
+
+def _coupling(t: TrueSignals) -> FloatArray:
+    """The same friction on this joint and on J3, from the sum of their velocities."""
+    torque = np.zeros_like(t.positions)
+    velocity_sum = t.velocity + t.velocities[J3]
+    dry = 2.0 * np.sign(velocity_sum)
+    viscous = 0.8 * velocity_sum
+    torque[[t.axis, J3]] = dry + viscous
+    return torque
+
+
+def _inertial_coupling(t: TrueSignals) -> FloatArray:
+    torque = np.zeros_like(t.positions)
+    torque[t.axis] = 0.25 * t.accelerations[J3]
+    torque[J3] = 0.25 * t.accelerations[t.axis]
+    return torque
+
+
+def _hinge(t: TrueSignals) -> FloatArray:
+    """A spring that begins at 0.5 rad."""
+    beyond_rad = t.position - 0.5
+    return np.where(t.position > 0.5, 12.0 * beyond_rad, 0.0)
+
+
+def _hose(t: TrueSignals) -> FloatArray:
+    """A hose of 30 Nm/rad whose way is 0.8 q_i − 0.6 q_j, which inertia_columns and pushes."""
+    way = 0.8 * t.position - 0.6 * t.positions[J3]
+    force = 30.0 * way
+    torque = np.zeros_like(t.positions)
+    torque[t.axis] = 0.8 * force
+    torque[J3] = -0.6 * force
+    return torque
+
+
+def _slack_cable(t: TrueSignals) -> FloatArray:
+    """A cable that inertia_columns where the joint is before J3, around both at one radius;
+    half of it on each.
+    """
+    position_difference = t.position - t.positions[J3]
+    stretch = np.where(t.position > t.positions[J3], position_difference, 0.0)
+    torque = np.zeros_like(t.positions)
+    torque[t.axis] = 15.0 * stretch
+    torque[J3] = -15.0 * stretch
+    return torque
+
+
+def _offset_drift(t: TrueSignals) -> FloatArray:
+    session_s = t.started_s + t.time_s
+    return np.asarray(4.0 * np.exp(-session_s / 60.0))
+
+
+def _gravity_compensator(t: TrueSignals) -> FloatArray:
+    phase = np.arctan2(3.0, 4.0)
+    return np.asarray(5.0 * np.cos(2.0 * t.position - phase))
+
+
+def _counterbalance(t: TrueSignals) -> FloatArray:
+    """A constant force along a balancer: its work F Δs between neighbouring angles,
+    over their difference.
+    """
+    force_n = 16.0
+    angle = t.position - np.pi / 3.0
+    shorter = _balancer_length_m(angle - 1e-6)
+    longer = _balancer_length_m(angle + 1e-6)
+    return np.asarray(force_n * (longer - shorter) / 2e-6)
+
+
+def _balancer_length_m(angle: FloatArray) -> FloatArray:
+    foot_m = 1.0
+    lever_m = 0.5
+    x_m = np.cos(angle) * lever_m
+    y_m = np.sin(angle) * lever_m
+    return np.hypot(foot_m - x_m, y_m)
 
 
 CASES = (
-    Planted("spring", 1, lambda t: 9.0 * t.position, (9.0,)),
-    Planted("cogging", 0, lambda t: 4.0 * np.cos(t.motor_angle) + 3.0 * np.sin(t.motor_angle), (4.0, 3.0)),  # noqa: E501
-    Planted("ripple", 0, lambda t: 4.0 * np.cos(0.5 * t.motor_angle) + 3.0 * np.sin(0.5 * t.motor_angle), (4.0, 3.0)),  # noqa: E501
-    Planted("saturation", 1, lambda t: _saturated(t.motor_torque, GAINS[1], 10.0) - t.motor_torque, (0.01, 2e-4)),  # noqa: E501
-    Planted("lag", 0, lambda t: _followed(t.motor_torque, 0.01, t.rate_hz) - t.motor_torque, (0.01,)),  # noqa: E501
-    Planted("time-skew", 0, lambda t: _late(t.motor_torques, 0.008, t.rate_hz) - t.motor_torques, (0.008,)),  # noqa: E501
-)  # fmt: skip
-SMALL_CASES = (
-    Planted("stribeck", 1, lambda t: 6.0 * np.sign(t.velocity) / np.exp(np.abs(t.velocity) / 0.2), (6.0,)),  # noqa: E501
-    Planted("nonlinear-viscous", 2, lambda t: 1.5 * t.velocity * np.abs(t.velocity), (1.5,)),
-    Planted("asymmetric-viscous", 2, lambda t: 0.9 * np.maximum(t.velocity, -t.velocity), (0.9,)),
-    Planted("load-friction", 2, lambda t: 0.15 * np.abs(t.load) * np.sign(t.velocity), (0.15,)),
-    Planted("position-friction", 2, lambda t: np.sign(t.velocity) * 1.5 * np.cos(t.position + 0.7), (1.147, -0.966)),  # noqa: E501
-    Planted("warm-up", 1, lambda t: _cold(t, t.time_s, 20.0), (5.0, 2.0)),
-    Planted("warm-up", 2, lambda t: _cold(t, t.started_s + t.time_s, 80.0), (5.0, 2.0)),
-    Planted("temperature-friction", 1, _heated, (0.15, -0.1)),
-    Planted("presliding", 1, lambda t: 9.0 * (_bristle(t, 0.08) - np.sign(t.velocity)), (9.0,)),
-    Planted("backlash", 1, lambda t: _pushed(t, 0.004), (0.004,)),
-    Planted("elasticity", 1, lambda t: -0.0005 * t.pull() * t.accelerated(t.load), (0.0005,)),
-    Planted("efficiency", 1, lambda t: _meshed(t, 0.85), ((1 - 0.85**2) / (1 + 0.85**2),)),
-    Planted("coupling", 1, lambda t: _rubbing(t, 2), (2.0, 0.8)),
-    Planted("inertial-coupling", 0, lambda t: _inertial(t, 2), (0.25,)),
-    Planted("hinge", 1, lambda t: np.where(t.position > 0.5, 12.0 * (t.position - 0.5), 0.0), (12.0,)),  # noqa: E501
-    Planted("cable", 1, lambda t: _hose(t, 2), (19.2, -14.4, 10.8)),
-    Planted("slack-cable", 1, lambda t: _slack_cable(t, 2), (30.0,)),
-    Planted("offset-drift", 1, lambda t: 4.0 * np.exp(-(t.started_s + t.time_s) / 60.0), (4.0,)),
-    Planted("gravity-compensator", 1, lambda t: 5.0 * np.cos(2.0 * t.position - np.arctan2(3.0, 4.0)), (4.0, 3.0)),  # noqa: E501
-    Planted("counterbalance", 1, lambda t: _lengthening(t.position - np.pi / 3.0, 1.0, 0.5, 16.0), (8.0,)),  # noqa: E501
-)  # fmt: skip
+    Planted("spring", 1, _spring, (9.0,)),
+    Planted("cogging", 0, _cogging, (4.0, 3.0)),
+    Planted("ripple", 0, _ripple, (4.0, 3.0)),
+    Planted("saturation", 1, _saturation, (0.01, 2e-4)),
+    Planted("lag", 0, _lag, (0.01,)),
+    Planted("time-skew", 0, _time_skew, (0.008,)),
+)
+FRICTION_CASES = (
+    Planted("stribeck", 1, _stribeck, (6.0,)),
+    Planted("nonlinear-viscous", 2, _nonlinear_viscous, (1.5,)),
+    Planted("asymmetric-viscous", 2, _asymmetric_viscous, (0.9,)),
+    Planted("load-friction", 2, _load_friction, (0.15,)),
+    Planted("position-friction", 2, _position_friction, (1.147, -0.966)),
+    Planted("warm-up", 1, _warm_up_of_a_run, (5.0, 2.0)),
+    Planted("warm-up", 2, _warm_up_of_a_session, (5.0, 2.0)),
+    Planted("temperature-friction", 1, _temperature_friction, (0.15, -0.1)),
+    Planted("presliding", 1, _presliding, (9.0,)),
+)
+GEAR_CASES = (
+    Planted("backlash", 1, _backlash, (0.004,)),
+    Planted("elasticity", 1, _elasticity, (0.0005,)),
+    Planted("efficiency", 1, _efficiency, ((1 - EFFICIENCY**2) / (1 + EFFICIENCY**2),)),
+    Planted("coupling", 1, _coupling, (2.0, 0.8)),
+    Planted("inertial-coupling", 0, _inertial_coupling, (0.25,)),
+)
+OUTSIDE_CASES = (
+    Planted("hinge", 1, _hinge, (12.0,)),
+    Planted("cable", 1, _hose, (19.2, -14.4, 10.8)),
+    Planted("slack-cable", 1, _slack_cable, (30.0,)),
+    Planted("offset-drift", 1, _offset_drift, (4.0,)),
+    Planted("gravity-compensator", 1, _gravity_compensator, (4.0, 3.0)),
+    Planted("counterbalance", 1, _counterbalance, (8.0,)),
+)
+SMALL_CASES = (*FRICTION_CASES, *GEAR_CASES, *OUTSIDE_CASES)
 """On the arm of three axes, which needs a third of the time."""
+
+
+def _case(family: str) -> Planted:
+    """The first case of a family."""
+    cases = (*CASES, *SMALL_CASES)
+    return next(case for case in cases if case.family == family)
 
 
 @dataclass(frozen=True)
@@ -296,9 +440,10 @@ def warmth(run: Run, started_s: float) -> FloatArray:
     """Temperature of each of three drives [°C], shape (k, 3):
     slow waves between 30 and 50 °C, as loads change.
     """
-    phase = (started_s + run.time_s[:, None]) / np.array([31.0, 23.0, 41.0]) + np.array(
-        [0.3, 2.0, 4.1]
-    )
+    session_s = started_s + run.time_s[:, None]
+    time_constant_s = np.array([31.0, 23.0, 41.0])
+    start_phase = np.array([0.3, 2.0, 4.1])
+    phase = session_s / time_constant_s + start_phase
     return np.asarray(40.0 + 10.0 * np.sin(phase))
 
 
@@ -307,11 +452,13 @@ def small_arm(small_truth: Truth, small_runs: tuple[Run, ...]) -> Arm:
     """In a session in which every run began a while after the one before,
     with drives that warm up and cool down.
     """
-    runs = tuple(
-        replace(run, started_s=PAUSE_S * index, temperature_c=warmth(run, PAUSE_S * index))
-        for index, run in enumerate(small_runs)
-    )
-    clean = gathered(small_truth, runs)
+    runs = []
+    for index, run in enumerate(small_runs):
+        started_s = PAUSE_S * index
+        temperature_c = warmth(run, started_s)
+        timed = replace(run, started_s=started_s, temperature_c=temperature_c)
+        runs.append(timed)
+    clean = gathered(small_truth, tuple(runs))
     signals = {data.name: _true(small_truth, data) for data in clean.datasets}
     return Arm(small_truth, clean, {}, signals)
 
@@ -321,32 +468,32 @@ def _true(truth: Truth, data: Dataset) -> TrueSignals:
     parameters = truth.parameters.copy()
     if data.payload is not None:
         parameters[truth.model.flange] += list(PAYLOAD_TRUTH.values())
-    rigid = np.array([name[:2] not in ("Ia", "fv", "fs", "of") for name in names])
-    rubbing = np.array([name[:2] in ("fv", "fs") and name[2] != "m" for name in names])
+    rigid = np.array([_is_rigid(name) for name in names])
+    rubbing = np.array([_is_joint_friction(name) for name in names])
+    rigid_parameters = parameters * rigid
     motion = data.motion()
     columns = truth.model.regressor(motion)
 
-    def pulls(axis: int) -> FloatArray:
+    def inertia_columns(axis: int) -> FloatArray:
         still = np.zeros_like(motion.position_rad)
         one = still.copy()
         one[:, axis] = 1.0
-        moved, at_rest = (
-            np.einsum(
-                "jck,c->jk",
-                truth.model.regressor(Motion(motion.position_rad, still, a)),
-                parameters * rigid,
-            )
-            for a in (one, still)
-        )
+        accelerated = Motion(motion.position_rad, still, one)
+        held = Motion(motion.position_rad, still, still)
+        moved = _torque(truth.model.regressor(accelerated), rigid_parameters)
+        at_rest = _torque(truth.model.regressor(held), rigid_parameters)
         return np.asarray(moved - at_rest)
 
-    to_motor = truth.model.drive_train.to_motor
-    motor_torques = to_motor @ np.einsum("jck,c->jk", columns, parameters)
-    ratio = truth.model.drive_train.ratio
-    motor_angles = ratio @ motion.position_rad.T
-    loads = np.einsum("jck,c->jk", columns, parameters * rigid)
-    frictions = np.einsum("jck,c->jk", columns, parameters * rubbing)
+    drive_train = truth.model.drive_train
+    joint_torques = _torque(columns, parameters)
+    motor_torques = drive_train.to_motor @ joint_torques
+    motor_angles = drive_train.ratio @ motion.position_rad.T
+    loads = _torque(columns, rigid_parameters)
+    frictions = _torque(columns, parameters * rubbing)
     time_s = data.time_s - data.time_s[0]
+    temperatures = np.zeros((0, 0))
+    if data.temperature_c is not None:
+        temperatures = data.temperature_c.T
     return TrueSignals(
         axis=0,
         positions=motion.position_rad.T,
@@ -359,9 +506,24 @@ def _true(truth: Truth, data: Dataset) -> TrueSignals:
         time_s=time_s,
         started_s=data.started_s or 0.0,
         rate_hz=data.rate_hz,
-        pulls=pulls,
-        temperatures=np.zeros((0, 0)) if data.temperature_c is None else data.temperature_c.T,
+        inertia_columns=inertia_columns,
+        temperatures=temperatures,
     )
+
+
+def _is_rigid(name: str) -> bool:
+    """Whether a column of the regressor is of a link, neither of a rotor nor of friction."""
+    return name[:2] not in ("Ia", "fv", "fs", "of")
+
+
+def _is_joint_friction(name: str) -> bool:
+    """Whether a column of the regressor is of friction on a joint, not on a motor."""
+    return name[:2] in ("fv", "fs") and name[2] != "m"
+
+
+def _torque(columns: FloatArray, parameters: FloatArray) -> FloatArray:
+    """Torque of every joint, shape (n, k), of a regressor of shape (n, c, k)."""
+    return np.asarray(np.einsum("jck,c->jk", columns, parameters))
 
 
 def _with(arm: Arm, planted: Planted) -> Evidence:
@@ -387,20 +549,23 @@ def _family(name: str) -> tuple[Effect, ...]:
 
 def test_every_family_is_planted() -> None:
     """Those of joints without a motor in test_closed_chains.py."""
-    on_axes = {family[0].name for family in EFFECTS if family[0].with_motor}
-    families = {case.family for case in (*CASES, *SMALL_CASES)}
-    assert families == on_axes
+    simplest = [family[0] for family in EFFECTS]
+    on_axes = {effect.name for effect in simplest if effect.with_motor}
+    planted = {case.family for case in (*CASES, *SMALL_CASES)}
+    assert planted == on_axes
 
 
 @pytest.mark.parametrize("planted", CASES, ids=lambda planted: planted.family)
-def test_it_is_named_with_its_size_and_sign(arm: Arm, planted: Planted) -> None:
+def test_planted_effect_is_named_with_its_size_and_sign(arm: Arm, planted: Planted) -> None:
     _is_named(arm, planted)
 
 
 @pytest.mark.parametrize(
     "planted", SMALL_CASES, ids=lambda planted: f"{planted.family}-{planted.axis}"
 )
-def test_so_it_is_on_a_smaller_arm(small_arm: Arm, planted: Planted) -> None:
+def test_planted_effect_on_a_small_arm_is_named_with_its_size_and_sign(
+    small_arm: Arm, planted: Planted
+) -> None:
     _is_named(small_arm, planted)
 
 
@@ -411,39 +576,46 @@ def _is_named(arm: Arm, planted: Planted) -> None:
     findings = rank_effects(search_problem, rng, GATES)
     best = findings[0]
     assert best.passed
-    names = [(placed.effect.name, placed.axis) for placed in (best.placed, *best.ambiguity)]
-    assert (planted.family, planted.axis) in names
-    own = next(f for f in findings if (f.effect.name, f.axis) == (planted.family, planted.axis))
+    place = (planted.family, planted.axis)
+    indistinguishable = (best.placed, *best.ambiguity)
+    assert place in [(placed.effect.name, placed.axis) for placed in indistinguishable]
+    own = next(finding for finding in findings if (finding.effect.name, finding.axis) == place)
     after = with_effects(start, (own.placed,))
-    count = len(planted.expected)
-    found = after.estimate.parameters[len(after.rows_without_effects.columns) :][:count]
-    largest_absolute_expected = max(np.abs(planted.expected))
+    first = len(after.rows_without_effects.columns)
+    coefficients = after.estimate.parameters[first:]
+    found = coefficients[: len(planted.expected)]
     expected = np.array(planted.expected)
-    assert found == pytest.approx(expected, rel=0.2, abs=0.1 * largest_absolute_expected)
-    assert training_error(after).axes[planted.axis] < training_error(start).axes[planted.axis]
+    largest_expected = max(np.abs(expected))
+    assert found == pytest.approx(expected, rel=0.2, abs=0.1 * largest_expected)
+    error_before = training_error(start).axes[planted.axis]
+    error_after = training_error(after).axes[planted.axis]
+    assert error_after < error_before
 
 
-FAST = ("elasticity", "backlash", "presliding", "coupling")
-"""Families of torques that change where a motion does, as what is late does."""
+@pytest.mark.parametrize("family", ["elasticity", "backlash", "presliding", "coupling"])
+def test_a_fast_effect_is_no_delay_and_no_wrong_zero(small_arm: Arm, family: str) -> None:
+    """Torques of these families change where a motion does, as what is late does.
 
-
-@pytest.mark.parametrize(
-    "planted", [one for one in SMALL_CASES if one.family in FAST], ids=lambda one: one.family
-)
-def test_a_fast_effect_is_no_delay_and_no_wrong_zero(small_arm: Arm, planted: Planted) -> None:
-    """The check of the description called a spring in the gear of J1 a position that is early by
+    The check of the description called a spring in the gear of J1 a position that is early by
     3.5 ms.
     """
-    evidence = _with(small_arm, planted)
+    evidence = _with(small_arm, _case(family))
     rng = np.random.default_rng(0)
     check = check_geometry(evidence, rng, GATES)
     assert check.mistakes == ()
 
 
-def _gain_errors(arm: Arm, planted: Planted, first_order: Effect) -> tuple[Effect, float, float]:
-    """Effect that is found, and errors of its gain by a first-order form of it and by what was
-    found.
-    """
+@dataclass(frozen=True)
+class GainErrors:
+    """Effect that is found, and relative errors of the gain of its axis."""
+
+    found: Effect
+    by_first_order: float
+    by_found: float
+
+
+def _gain_errors(arm: Arm, planted: Planted, first_order: Effect) -> GainErrors:
+    """Errors of a gain by a first-order form of an effect and by the form that is found."""
     start = _with(arm, planted)
     rng = np.random.default_rng(0)
     families = (_family(planted.family),)
@@ -451,58 +623,61 @@ def _gain_errors(arm: Arm, planted: Planted, first_order: Effect) -> tuple[Effec
     assert first.accepted is not None
     assert first.accepted.axis == planted.axis
     assert last.accepted is None
-    effects = (PlacedEffect(first_order, planted.axis),)
-    before = with_effects(start, effects)
-    plain, whole = (
-        float(np.abs(one.estimate.gains / arm.truth.gains - 1.0)[planted.axis])
-        for one in (before, first.after)
+    placed = PlacedEffect(first_order, planted.axis)
+    with_first_order = with_effects(start, (placed,))
+    return GainErrors(
+        found=first.after.effects[0].effect,
+        by_first_order=_gain_error(arm, with_first_order)[planted.axis],
+        by_found=_gain_error(arm, first.after)[planted.axis],
     )
-    return first.after.effects[0].effect, plain, whole
+
+
+def _gain_error(arm: Arm, evidence: Evidence) -> FloatArray:
+    """Relative error of every gain, shape (m,)."""
+    gain_ratio = evidence.estimate.gains / arm.truth.gains
+    return np.asarray(np.abs(gain_ratio - 1.0))
 
 
 def test_the_filter_of_a_lag_keeps_its_gain(arm: Arm) -> None:
     """What a first-order expansion lacks goes into the gain."""
-    planted = next(case for case in CASES if case.family == "lag")
-    found, plain, whole = _gain_errors(arm, planted, Lag())
-    assert found.settings["filter_s"] == pytest.approx(0.01, rel=0.1)
-    smallest = min(0.5 * plain, 0.01)
-    assert whole < smallest
+    errors = _gain_errors(arm, _case("lag"), Lag())
+    assert errors.found.settings["filter_s"] == pytest.approx(0.01, rel=0.1)
+    assert errors.by_found < 0.5 * errors.by_first_order
+    assert errors.by_found < 0.01
 
 
 def test_a_second_term_keeps_the_gain_of_a_saturated_motor(arm: Arm) -> None:
     """It rests on few moves, whose random signs test nothing:
     the first one says whether the effect is there.
     """
-    planted = Planted(
-        "saturation", 2, lambda t: _saturated(t.motor_torque, GAINS[2], 12.0) - t.motor_torque, ()
-    )
+
+    def torque(t: TrueSignals) -> FloatArray:
+        return _torque_lost_by_saturation(t, half_a=12.0)
+
+    planted = Planted("saturation", 2, torque, ())
     evidence = _with(arm, planted)
     families = (_family("saturation"),)
     (family,) = search_problem_of(evidence).test(families, 2)
-    first, both = (moves_behind(trial.gram) for _, trial in family.members)
-    assert both < FEWEST_MOVES < first
-    found, plain, whole = _gain_errors(arm, planted, Saturation())
-    assert found == Saturation(two_terms=1)
-    smallest = min(0.5 * plain, 0.01)
-    assert whole < smallest
+    moves_of_first, moves_of_both = (moves_behind(trial.gram) for _, trial in family.members)
+    assert moves_of_both < FEWEST_MOVES < moves_of_first
+    errors = _gain_errors(arm, planted, Saturation())
+    assert errors.found == Saturation(two_terms=1)
+    assert errors.by_found < 0.5 * errors.by_first_order
+    assert errors.by_found < 0.01
 
 
 def test_a_richer_form_needs_no_possible_simpler_one(small_arm: Arm) -> None:
     problem = search_problem_of(small_arm.clean)
     families = (_family("saturation"),)
     (family,) = problem.test(families, 1)
-    (plain, one), (whole, both) = family.members
-    coefficients = np.array([-1e9])
-    changed_both = replace(both, coefficients=np.array([1.0, 1.0]))
-    trials = (
-        replace(one, coefficients=coefficients),
-        changed_both,
-    )
-    members = tuple(zip((plain, whole), trials, strict=True))
+    (simple, simple_trial), (rich, rich_trial) = family.members
+    impossible = replace(simple_trial, coefficients=np.array([-1e9]))
+    possible = replace(rich_trial, coefficients=np.array([1.0, 1.0]))
+    members = ((simple, impossible), (rich, possible))
     tested = (replace(family, members=members),)
     rng = np.random.default_rng(0)
     (finding,) = rank_families(problem, tested, rng, GATES)
-    assert finding.effect == whole
+    assert finding.effect == rich
 
 
 def test_motors_in_another_order_change_no_verdict(arm: Arm) -> None:
@@ -522,21 +697,24 @@ def test_motors_in_another_order_change_no_verdict(arm: Arm) -> None:
     turned = replace(start, model=model, training=training, estimate=estimate)
     families = (_family("spring"), _family("stribeck"), _family("load-friction"))
     rng = np.random.default_rng(0)
-    findings = rank_effects(search_problem_of(turned), rng, GATES, families)
-    effect = findings[0].effect
-    passed = findings[0].passed
-    assert (effect.name, findings[0].axis, passed) == ("spring", 1, True)
+    best = rank_effects(search_problem_of(turned), rng, GATES, families)[0]
+    assert best.effect.name == "spring"
+    assert best.axis == 1
+    assert best.passed
     search_problem = search_problem_of(start, arm.cache)
-    same = rank_effects(search_problem, np.random.default_rng(0), GATES, families)
-    assert findings[0].explained == pytest.approx(same[0].explained, rel=1e-3)
+    rng = np.random.default_rng(0)
+    best_in_order = rank_effects(search_problem, rng, GATES, families)[0]
+    assert best.explained == pytest.approx(best_in_order.explained, rel=1e-3)
 
 
 def test_a_dead_current_channel_is_named(truth: Truth, noisy_runs: tuple[Run, ...]) -> None:
-    dead = tuple(
-        replace(run, current_a=run.current_a * np.array([1, 1, 1, 0, 1, 1])) for run in noisy_runs
-    )
+    channels = np.array([1, 1, 1, 0, 1, 1])
+    dead = []
+    for run in noisy_runs:
+        current_a = run.current_a * channels
+        dead.append(replace(run, current_a=current_a))
     with pytest.raises(CurrentConstant, match="axis J4: found a current that is zero throughout"):
-        identify(truth.model, dead, CONDITIONING)
+        identify(truth.model, tuple(dead), CONDITIONING)
 
 
 def test_too_few_moves_are_refused_and_continuous_motion_counts_by_time(
@@ -546,20 +724,22 @@ def test_too_few_moves_are_refused_and_continuous_motion_counts_by_time(
     never_still = replace(CONDITIONING, standstill_rad_s=standstill_rad_s)
     whole = identify(truth.model, noisy_runs, never_still)
     assert len(whole.system.clusters) >= 4 * 11
-    assert np.all(whole.estimate.gains_std > 1e-4 * np.abs(GAINS))
+    smallest_std = 1e-4 * np.abs(GAINS)
+    assert np.all(whole.estimate.gains_std > smallest_std)
     rate_hz = clean_runs[0].rate_hz
     few = round(5.0 * rate_hz)
-    short = tuple(
-        replace(
-            run,
-            time_s=run.time_s[:few],
-            position_rad=run.position_rad[:few],
-            current_a=run.current_a[:few],
-        )
-        for run in clean_runs
-    )
+    short = tuple(_first_samples(run, few) for run in clean_runs)
     with pytest.raises(TooFewMoves, match="record longer"):
         identify(truth.model, short, never_still)
+
+
+def _first_samples(run: Run, count: int) -> Run:
+    return replace(
+        run,
+        time_s=run.time_s[:count],
+        position_rad=run.position_rad[:count],
+        current_a=run.current_a[:count],
+    )
 
 
 def test_sigma_is_true_for_correlated_noise(small_arm: Arm) -> None:
@@ -571,16 +751,19 @@ def test_sigma_is_true_for_correlated_noise(small_arm: Arm) -> None:
     bare = clean.rows_without_effects
     estimate = clean.estimate
     to_motor = small_arm.truth.model.drive_train.to_motor
-    exact = to_motor @ estimate.predicted_torque(bare) / estimate.gains[:, None]
+    motor_torque = to_motor @ estimate.predicted_torque(bare)
+    exact_a = motor_torque / estimate.gains[:, None]
+    new_share = np.sqrt(1 - 0.67**2)
     gains = []
     claimed = []
     for _ in range(24):
-        noise = np.empty_like(exact)
-        noise[:, 0] = rng.normal(size=len(exact))
-        drawn = rng.normal(size=exact.shape)
-        for row in range(1, exact.shape[1]):
-            noise[:, row] = 0.67 * noise[:, row - 1] + np.sqrt(1 - 0.67**2) * drawn[:, row]
-        added_a = exact + 0.05 * noise - bare.current
+        noise = np.empty_like(exact_a)
+        noise[:, 0] = rng.normal(size=len(exact_a))
+        drawn = rng.normal(size=exact_a.shape)
+        for row in range(1, exact_a.shape[1]):
+            before = noise[:, row - 1]
+            noise[:, row] = 0.67 * before + new_share * drawn[:, row]
+        added_a = exact_a + 0.05 * noise - bare.current
         found = with_current(clean, added_a).estimate
         gains.append(found.gains)
         claimed.append(found.gains_std)
@@ -593,11 +776,11 @@ def test_sigma_is_true_for_correlated_noise(small_arm: Arm) -> None:
 
 
 def test_the_loop_ends_where_nothing_is_left(small_arm: Arm) -> None:
-    planted = next(case for case in SMALL_CASES if case.family == "load-friction")
-    start = _with(small_arm, planted)
+    start = _with(small_arm, _case("load-friction"))
     rng = np.random.default_rng(1)
-    steps = find_effects(start, rng)
-    assert [step.accepted is not None for step in steps] == [True, False]
+    first, last = find_effects(start, rng)
+    assert first.accepted is not None
+    assert last.accepted is None
 
 
 def test_a_name_that_structure_refutes_bends_no_gain(arm: Arm) -> None:
@@ -606,50 +789,49 @@ def test_a_name_that_structure_refutes_bends_no_gain(arm: Arm) -> None:
 
     Physics refuses that of two terms, because d < 0, but not that of one term.
     """
-    grown = Planted(
-        "load-friction", 1, lambda t: 0.3 * np.abs(t.load) * np.sign(t.velocity), (0.3,)
-    )
+
+    def torque(t: TrueSignals) -> FloatArray:
+        return _friction_by_load(t, 0.3)
+
+    grown = Planted("load-friction", 1, torque, (0.3,))
     start = _with(arm, grown)
     families = _family("saturation"), _family("stribeck"), _family("spring")
     rng = np.random.default_rng(0)
     (step,) = find_effects(start, rng, GATES, families)
     assert step.accepted is None
-    aside = {one.finding.effect.name: one for one in step.set_aside}
-    assert set(aside) == {"smooth-load", "saturation"}
-    assert "the gain of J2 by" in aside["saturation"].reason(("J1", "J2", "J3", "J4", "J5", "J6"))
-    effect = aside["smooth-load"].finding.effect
-    rival = aside["saturation"].rival
-    assert rival == PlacedEffect(effect, 1)
+    rejected = {candidate.finding.effect.name: candidate for candidate in step.set_aside}
+    assert set(rejected) == {"smooth-load", "saturation"}
+    saturation = rejected["saturation"]
+    joint_names = ("J1", "J2", "J3", "J4", "J5", "J6")
+    assert "the gain of J2 by" in saturation.reason(joint_names)
+    smooth_load = rejected["smooth-load"].finding.effect
+    assert saturation.rival == PlacedEffect(smooth_load, 1)
     # With it the gain would be off by more than three times as much.
-    finding = aside["saturation"].finding
-    effects = (PlacedEffect(finding.effect, 1),)
-    bent_by_name = with_effects(start, effects).estimate
-    before, after = (
-        np.abs(one.gains / arm.truth.gains - 1.0)[1] for one in (start.estimate, bent_by_name)
-    )
-    assert after > 3.0 * before
+    placed = PlacedEffect(saturation.finding.effect, 1)
+    with_saturation = with_effects(start, (placed,))
+    error_before = _gain_error(arm, start)[1]
+    error_after = _gain_error(arm, with_saturation)[1]
+    assert error_after > 3.0 * error_before
 
 
 def test_friction_against_temperature_is_named_first_and_the_worst_gain_gets_better(
     small_arm: Arm,
 ) -> None:
-    planted = next(case for case in SMALL_CASES if case.family == "temperature-friction")
-    start = _with(small_arm, planted)
+    start = _with(small_arm, _case("temperature-friction"))
     rng = np.random.default_rng(1)
     steps = find_effects(start, rng)
     first = steps[0].accepted
     assert first is not None
-    assert (first.effect.name, first.axis) == ("temperature-friction", 1)
-    last_step = steps[-1]
-    before, after = (
-        np.abs(evidence.estimate.gains / small_arm.truth.gains - 1.0).max()
-        for evidence in (start, last_step.after)
-    )
-    assert after < before
+    assert first.effect.name == "temperature-friction"
+    assert first.axis == 1
+    worst_before = _gain_error(small_arm, start).max()
+    worst_after = _gain_error(small_arm, steps[-1].after).max()
+    assert worst_after < worst_before
 
 
 def test_drives_that_warm_up_without_an_effect_give_none(small_arm: Arm) -> None:
     rng = np.random.default_rng(1)
     (step,) = find_effects(small_arm.clean, rng)
     assert step.accepted is None
-    assert "temperature-friction" in {finding.effect.name for finding in step.findings}
+    candidates = {finding.effect.name for finding in step.findings}
+    assert "temperature-friction" in candidates

@@ -14,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import kstest, norm
 
+from ident.arrays import FloatArray
 from ident.drift import change as change_module
 from ident.drift.change import (
     CHART,
@@ -21,6 +22,7 @@ from ident.drift.change import (
     Alarm,
     AlarmKind,
     Chart,
+    Drift,
     Pattern,
     change_significance,
     cusum,
@@ -41,18 +43,25 @@ from tests.studies.drift_study import (
 
 NAMES = tuple(f"J{number}" for number in range(1, AXES + 1))
 GAINS = np.array([33.9, 32.4, 24.2, -9.21, 16.3, 6.79])
+GAINS_STD = 0.004 * np.abs(GAINS)
+STD = 0.04
+"""Standard deviation of a calibration of a gain of 10: 0.4 %."""
 _gains = st.floats(0.1, 1e3) | st.floats(-1e3, -0.1)
 
 
 def test_constants_of_the_normal_distribution_are_those_of_scipy() -> None:
     cut = change_module._CUT
-    expected = norm.expect(lambda z: np.minimum(z**2, cut**2))
-    assert pytest.approx(expected, rel=1e-9) == change_module._MEAN_OF_CUT
-    assert pytest.approx(norm.ppf(0.75), rel=1e-15) == change_module._MEDIAN_OF_NORMAL
-    sigmas = [change_significance(0.0, 0.6, x, 0.8, dispersion=1.0) for x in (0.1, 2.0, 30.0)]
-    expected_p = 2.0 * norm.sf([0.1, 2.0, 30.0])
-    probabilities = [change.probability for change in sigmas]
-    assert probabilities == pytest.approx(expected_p, rel=1e-12)
+    mean_of_cut = norm.expect(lambda z: np.minimum(z**2, cut**2))
+    assert pytest.approx(mean_of_cut, rel=1e-9) == change_module._MEAN_OF_CUT
+    median_of_normal = norm.ppf(0.75)
+    assert pytest.approx(median_of_normal, rel=1e-15) == change_module._MEDIAN_OF_NORMAL
+
+
+@pytest.mark.parametrize("sigmas", [0.1, 2.0, 30.0])
+def test_probability_of_a_change_is_that_of_scipy(sigmas: float) -> None:
+    change = change_significance(0.0, 0.6, sigmas, 0.8, dispersion=1.0)
+    expected = 2.0 * norm.sf(sigmas)
+    assert change.probability == pytest.approx(expected, rel=1e-12)
 
 
 def test_a_history_is_judged_without_importing_scipy() -> None:
@@ -60,16 +69,15 @@ def test_a_history_is_judged_without_importing_scipy() -> None:
         "import sys, ident.drift.change, ident.drift.change; sys.exit(any(m.startswith('scipy') "
         "for m in sys.modules))"
     )
-    completed = subprocess.run([sys.executable, "-c", code], check=False)
+    command = [sys.executable, "-c", code]
+    completed = subprocess.run(command, check=False)
     assert completed.returncode == 0
 
 
-def test_a_probability_far_in_the_tail_has_no_digits() -> None:
-    certain, likely = (
-        decide(("J1",), [10.0], [0.01], [new], [0.01]).words for new in (12.0, 10.05)
-    )
-    assert "p < 1e-6 among 1" in certain
-    assert "p = 0.0" in likely
+@pytest.mark.parametrize(("new", "words"), [(12.0, "p < 1e-6 among 1"), (10.05, "p = 0.0")])
+def test_a_probability_far_in_the_tail_has_no_digits(new: float, words: str) -> None:
+    found = decide(("J1",), [10.0], [0.01], [new], [0.01])
+    assert words in found.words
 
 
 def test_one_change_is_the_two_sided_normal_test() -> None:
@@ -95,14 +103,22 @@ def test_a_change_does_not_depend_on_unit_nor_sign(
 
 
 def test_what_is_known_exactly_changes_surely_or_not_at_all() -> None:
-    probability = change_significance(2.0, 0.0, 2.0, 0.0).probability
-    assert probability == 1.0
-    assert change_significance(2.0, 0.0, 2.1, 0.0).probability == 0.0
-    percent = change_significance(0.0, 0.0, 1.0, 0.1).percent
-    assert percent == math.inf
-    for wrong in ((math.nan, 0.1, 1.0, 0.1), (1.0, -0.1, 1.0, 0.1), (1.0, 0.1, math.inf, 0.1)):
-        with pytest.raises(ValueError, match="expected finite"):
-            change_significance(*wrong)
+    same = change_significance(2.0, 0.0, 2.0, 0.0)
+    assert same.probability == 1.0
+    other = change_significance(2.0, 0.0, 2.1, 0.0)
+    assert other.probability == 0.0
+    from_zero = change_significance(0.0, 0.0, 1.0, 0.1)
+    assert from_zero.percent == math.inf
+
+
+@pytest.mark.parametrize(
+    "wrong", [(math.nan, 0.1, 1.0, 0.1), (1.0, -0.1, 1.0, 0.1), (1.0, 0.1, math.inf, 0.1)]
+)
+def test_a_change_of_no_finite_numbers_is_refused(
+    wrong: tuple[float, float, float, float],
+) -> None:
+    with pytest.raises(ValueError, match="expected finite"):
+        change_significance(*wrong)
 
 
 @pytest.mark.parametrize("wrong", [-0.5, math.nan, math.inf])
@@ -113,50 +129,54 @@ def test_a_dispersion_that_is_none_is_shown(wrong: float) -> None:
 
 def test_probabilities_of_no_change_are_uniform() -> None:
     rng = np.random.default_rng(1)
-    found = [
-        change_significance(
-            10.0 + 0.04 * a, 0.04, 10.0 + 0.03 * b, 0.03, dispersion=1.0
-        ).probability
-        for a, b in rng.standard_normal((2000, 2))
-    ]
-    assert kstest(found, "uniform").pvalue > 0.01
+    probabilities = []
+    for old_error, new_error in rng.standard_normal((2000, 2)):
+        old = 10.0 + 0.04 * old_error
+        new = 10.0 + 0.03 * new_error
+        change = change_significance(old, 0.04, new, 0.03, dispersion=1.0)
+        probabilities.append(change.probability)
+    assert kstest(probabilities, "uniform").pvalue > 0.01
 
 
 @pytest.mark.parametrize("common", [0.0, 0.9])
 def test_a_recalibration_without_change_is_seldom_taken_for_one(common: float) -> None:
     """However the errors of the axes depend on each other."""
     rng = np.random.default_rng(2)
-    correlation = np.full((AXES, AXES), common) + (1.0 - common) * np.eye(AXES)
-    root = np.linalg.cholesky(correlation)
-    std = 0.004 * np.abs(GAINS)
-    found = []
+    shared = np.full((AXES, AXES), common)
+    own = (1.0 - common) * np.eye(AXES)
+    root = np.linalg.cholesky(shared + own)
+    error_std = DISPERSION * GAINS_STD
+    changes = []
     for _ in range(1500):
-        old, new = (GAINS + DISPERSION * std * (root @ rng.standard_normal(AXES)) for _ in range(2))
-        differs = decide(NAMES, old, std, new, std).differs
-        found.append(differs)
+        old_error = error_std * (root @ rng.standard_normal(AXES))
+        new_error = error_std * (root @ rng.standard_normal(AXES))
+        found = decide(NAMES, GAINS + old_error, GAINS_STD, GAINS + new_error, GAINS_STD)
+        changes.append(found.differs)
     # 1 % asked for; 1500 draws know it to 0.26 %.
-    assert np.mean(found) < 0.02
+    assert np.mean(changes) < 0.02
 
 
 def test_a_recalibration_with_a_change_says_which_and_how_much() -> None:
-    std = 0.004 * np.abs(GAINS)
     new = GAINS.copy()
     new[3] *= 0.94
-    found = decide(NAMES, GAINS, std, new, std)
+    found = decide(NAMES, GAINS, GAINS_STD, new, GAINS_STD)
     assert found.differs
-    percent = found.changes[3].percent
-    assert percent == pytest.approx(-6.0)
-    assert found.adjusted[3] == min(found.adjusted) < 1e-6
+    assert found.changes[3].percent == pytest.approx(-6.0)
+    assert found.adjusted[3] == min(found.adjusted)
+    assert found.adjusted[3] < 1e-6
     assert found.words.startswith("changed by more than noise: J4 -6 % (10.")
     assert "J3" not in found.words
-    same = decide(NAMES, GAINS, std, GAINS, std)
-    assert not same.differs
-    assert same.words.startswith("no gain has changed by more than noise")
+
+
+def test_a_recalibration_with_the_same_gains_says_that_none_has_changed() -> None:
+    found = decide(NAMES, GAINS, GAINS_STD, GAINS, GAINS_STD)
+    assert not found.differs
+    assert found.words.startswith("no gain has changed by more than noise")
 
 
 def test_nothing_to_compare_changes_nothing() -> None:
-    differs = decide((), [], [], [], []).differs
-    assert not differs
+    found = decide((), [], [], [], [])
+    assert not found.differs
 
 
 @settings(max_examples=50, deadline=None)
@@ -167,45 +187,52 @@ def test_scatter_is_measured_in_any_unit_and_never_below_one(
     rng = np.random.default_rng(count)
     values, stds = draw(rng, (AXES, count + 1), 1.0)
     found = dispersions(values, stds)
-    sign = -1.0 if mirrored else 1.0
     assert found.shape == (AXES,)
     assert (found >= 1.0).all()
-    np.testing.assert_allclose(
-        dispersions(sign * unit * values + 7.0, unit * stds), found, rtol=1e-6
-    )
+    sign = -1.0 if mirrored else 1.0
+    other_values = sign * unit * values + 7.0
+    in_other_unit = dispersions(other_values, unit * stds)
+    np.testing.assert_allclose(in_other_unit, found, rtol=1e-6)
 
 
 @pytest.mark.parametrize("true", [1.0, 1.5, 3.0])
 def test_scatter_is_found_from_history(true: float) -> None:
     rng = np.random.default_rng(3)
     values, stds = draw(rng, (400, AXES, 60), true)
-    found = dispersions(values, stds)
-    assert float(np.median(found)) == pytest.approx(true, rel=0.08)
+    assert _median_dispersion(values, stds) == pytest.approx(true, rel=0.08)
+
+
+def _median_dispersion(values: FloatArray, stds: FloatArray) -> float:
+    return float(np.median(dispersions(values, stds)))
 
 
 def test_neither_a_step_nor_a_slow_drift_is_scatter() -> None:
     rng = np.random.default_rng(4)
     values, stds = draw(rng, (400, AXES, 30), 1.0)
-    plain = float(np.median(dispersions(values, stds)[:, 0]))
+    plain = dispersions(values, stds)[:, 0]
+    limit = float(np.median(plain)) + 0.05
     step = values.copy()
-    slope = values.copy()
     step[:, 0, 15:] += 20.0
+    of_step = dispersions(step, stds)[:, 0]
+    assert float(np.median(of_step)) < limit
+    slope = values.copy()
     slope[:, 0] += 0.3 * np.arange(30)
-    for changed in (step, slope):
-        assert float(np.median(dispersions(changed, stds)[:, 0])) < plain + 0.05
+    of_slope = dispersions(slope, stds)[:, 0]
+    assert float(np.median(of_slope)) < limit
 
 
 def test_a_quarter_of_the_differences_may_be_of_any_size() -> None:
     rng = np.random.default_rng(10)
     values, stds = draw(rng, (400, AXES, 25), 1.0)
-    plain = float(np.median(dispersions(values, stds)))
+    plain = _median_dispersion(values, stds)
     found = []
     for size in (1e3, 1e9):
         far = values.copy()
         far[..., 4:19:6] += size  # three calibrations off, six differences of 24
-        found.append(float(np.median(dispersions(far, stds))))
-    assert found[0] < 2.2 * plain
-    assert found[1] == pytest.approx(found[0], rel=1e-3)
+        found.append(_median_dispersion(far, stds))
+    off_by_a_thousand, off_by_a_billion = found
+    assert off_by_a_thousand < 2.2 * plain
+    assert off_by_a_billion == pytest.approx(off_by_a_thousand, rel=1e-3)
 
 
 def test_scatter_is_known_better_than_by_the_median() -> None:
@@ -214,29 +241,30 @@ def test_scatter_is_known_better_than_by_the_median() -> None:
     """
     rng = np.random.default_rng(11)
     values, stds = draw(rng, (300, 1, 1001), 1.5)
-    away = np.abs(np.diff(values)) / np.hypot(stds[..., 1:], stds[..., :-1])
-    median_away = np.median(away, axis=-1)
-    by_median = median_away / norm.ppf(0.75)
-    assert np.std(dispersions(values, stds)) < 0.85 * np.std(by_median)
+    difference_std = np.hypot(stds[..., 1:], stds[..., :-1])
+    scaled_differences = np.abs(np.diff(values)) / difference_std
+    by_median = np.median(scaled_differences, axis=-1) / norm.ppf(0.75)
+    found = dispersions(values, stds)
+    assert np.std(found) < 0.85 * np.std(by_median)
 
 
 def test_few_calibrations_say_nothing_of_scatter() -> None:
-    stds = np.ones((2, 3))
-    expected = [DISPERSION] * 2
-    np.testing.assert_array_equal(dispersions(np.ones((2, 3)), stds), expected)
+    values = np.ones((2, 3))
+    found = dispersions(values, np.ones((2, 3)))
+    np.testing.assert_array_equal(found, [DISPERSION, DISPERSION])
 
 
 def test_the_sums_are_pages() -> None:
     """By hand: baseline exact, k = 0.5, deviations of 2, 2, -3 σ."""
-    values = np.array([0.0, 2.0, 2.0, -3.0]) + 100.0
+    expected_deviations = [0.0, 2.0, 2.0, -3.0]
+    values = np.array(expected_deviations) + 100.0
     stds = np.ones(4)
     stds[0] = 1e-9
     chart = Chart(reference=0.5, baseline=1)
-    found = cusum_paths(values, stds, 1.0, chart)
-    expected = [0.0, 2.0, 2.0, -3.0]
-    np.testing.assert_allclose(found[0], expected)
-    np.testing.assert_allclose(found[1], [0.0, 1.5, 3.0, 0.0])
-    np.testing.assert_allclose(found[2], [0.0, 0.0, 0.0, 2.5])
+    deviations, upper, lower = cusum_paths(values, stds, 1.0, chart)
+    np.testing.assert_allclose(deviations, expected_deviations)
+    np.testing.assert_allclose(upper, [0.0, 1.5, 3.0, 0.0])
+    np.testing.assert_allclose(lower, [0.0, 0.0, 0.0, 2.5])
 
 
 def test_deviations_within_the_baseline_are_independent_and_normal() -> None:
@@ -246,48 +274,56 @@ def test_deviations_within_the_baseline_are_independent_and_normal() -> None:
     rng = np.random.default_rng(5)
     values = rng.standard_normal((20_000, CHART.baseline))
     stds = np.ones_like(values)
-    deviations = cusum_paths(values, stds, 1.0, CHART)[0][:, 1:]
+    all_deviations, _, _ = cusum_paths(values, stds, 1.0, CHART)
+    deviations = all_deviations[:, 1:]
     pvalue = kstest(deviations.ravel(), "norm").pvalue
     assert pvalue > 0.01
     correlation = np.corrcoef(deviations.T)
     identity = np.eye(CHART.baseline - 1)
-    correlation_difference = correlation - identity
-    assert np.abs(correlation_difference).max() < 0.03
+    correlation_error = np.abs(correlation - identity)
+    assert correlation_error.max() < 0.03
+
+
+def _step(before: float, count_before: int, after: float, count_after: int) -> FloatArray:
+    """Calibrations of a gain that changes once."""
+    return np.concatenate((np.full(count_before, before), np.full(count_after, after)))
+
+
+def _difference_std(count_before: int, count_after: int) -> float:
+    """Standard deviation of the difference of two means of calibrations."""
+    return DISPERSION * STD * math.sqrt(1 / count_after + 1 / count_before)
 
 
 def test_a_step_is_reported_with_its_size_its_time_and_its_side() -> None:
-    values = np.r_[np.full(14, -10.0), np.full(6, -9.4)]
-    stds = np.full(20, 0.04)
+    values = _step(-10.0, 14, -9.4, 6)
+    stds = np.full(20, STD)
     found = cusum(values, stds)
     assert found.alarmed
     assert found.onset == 13
     assert not found.alarms[-1].rose
     assert found.change_percent == pytest.approx(-6.0)
-    assert found.change_sigmas == pytest.approx(
-        -0.6 / (DISPERSION * 0.04 * math.sqrt(1 / 3 + 1 / 12))
-    )
+    assert found.change_sigmas == pytest.approx(-0.6 / _difference_std(12, 3))
     assert found.baseline == pytest.approx(-10.0)
-    assert found.alarms[0].index == 14
-    assert found.alarms[0].kind is AlarmKind.DRIFT  # 14 σ at once are beyond both limits
+    first_alarm = found.alarms[0]
+    assert first_alarm.index == 14
+    assert first_alarm.kind is AlarmKind.DRIFT  # 14 σ at once are beyond both limits
 
 
 @pytest.mark.parametrize(("count", "newest"), [(15, 1), (16, 2), (17, 3), (18, 3)])
 def test_a_step_has_its_whole_size_from_the_first_day_on(count: int, newest: int) -> None:
     """Calibrations before the onset are no part of the change after it."""
-    values = np.r_[np.full(14, 10.0), np.full(count - 14, 9.4)]
-    stds = np.full(count, 0.04)
+    values = _step(10.0, 14, 9.4, count - 14)
+    stds = np.full(count, STD)
     found = cusum(values, stds)
     assert found.alarmed
     assert found.onset == 13
     assert found.change_percent == pytest.approx(-6.0)
-    assert found.change_sigmas == pytest.approx(
-        -0.6 / (DISPERSION * 0.04 * math.sqrt(1 / newest + 1 / 12))
-    )
+    assert found.change_sigmas == pytest.approx(-0.6 / _difference_std(12, newest))
 
 
 def test_a_change_within_the_baseline_is_compared_with_what_was_before() -> None:
-    values = np.r_[np.full(5, 10.0), np.full(4, 10.6)]
-    stds = np.full(9, 0.04)
+    values = _step(10.0, 5, 10.6, 4)
+    stds = np.full(9, STD)
     found = cusum(values, stds)
     assert found.onset == 4
     assert found.change_percent == pytest.approx(6.0)
@@ -295,16 +331,17 @@ def test_a_change_within_the_baseline_is_compared_with_what_was_before() -> None
 
 
 def test_one_calibration_far_off_is_a_jump() -> None:
-    values = np.full(15, 10.0)
-    values[14] = 10.0 + 0.04 * DISPERSION * 5.8
-    stds = np.full(15, 0.04)
-    found = cusum(values, stds)
-    assert [alarm.kind for alarm in found.alarms] == [AlarmKind.JUMP]
-    calm = cusum(np.r_[values, 10.0, 10.0], np.full(17, 0.04))
-    assert calm.alarms == found.alarms
+    values = np.full(17, 10.0)
+    values[14] = 10.0 + STD * DISPERSION * 5.8
+    stds = np.full(17, STD)
+    found = cusum(values[:15], stds[:15])
+    (alarm,) = found.alarms
+    assert alarm.kind is AlarmKind.JUMP
+    assert found.alarm == alarm
+    calm = cusum(values, stds)
+    assert calm.alarms == (alarm,)
+    assert calm.alarm is None
     assert not calm.alarmed
-    expected = (found.alarms[0], None)
-    assert (found.alarm, calm.alarm) == expected
 
 
 def test_an_alarm_that_has_passed_changes_nothing_of_what_is_reported() -> None:
@@ -312,49 +349,66 @@ def test_an_alarm_that_has_passed_changes_nothing_of_what_is_reported() -> None:
     that one among them.
     """
     values = np.full(20, 10.0)
-    values[3] = 10.0 + 0.04 * DISPERSION * 6.5
-    stds = np.full(4, 0.04)
-    onset = cusum(values[:4], stds).onset
-    assert onset == 2
-    found = cusum(values, np.full(20, 0.04))
-    assert [alarm.index for alarm in found.alarms] == [3]
-    expected = (False, None, None, False)
-    assert (found.alarmed, found.alarm, found.onset, found.steady) == expected
-    assert found.baseline == pytest.approx(values[:12].mean())
-    assert found.baseline_std == pytest.approx(DISPERSION * 0.04 / math.sqrt(12))
-    assert found.change_percent == pytest.approx(100.0 * (10.0 / values[:12].mean() - 1.0))
+    values[3] = 10.0 + STD * DISPERSION * 6.5
+    stds = np.full(20, STD)
+    on_the_fourth_day = cusum(values[:4], stds[:4])
+    assert on_the_fourth_day.onset == 2
+    found = cusum(values, stds)
+    (alarm,) = found.alarms
+    assert alarm.index == 3
+    _reports_no_change(found)
+    baseline = values[:12].mean()
+    assert found.baseline == pytest.approx(baseline)
+    assert found.baseline_std == pytest.approx(DISPERSION * STD / math.sqrt(12))
+    change = 10.0 / baseline - 1.0
+    assert found.change_percent == pytest.approx(100.0 * change)
+
+
+def _reports_no_change(found: Drift) -> None:
+    assert not found.alarmed
+    assert found.alarm is None
+    assert found.onset is None
+    assert not found.steady
 
 
 def test_a_slope_that_has_ended_is_not_reported_along_its_line() -> None:
     """It rises by 0.7 σ a calibration for eight of them, and is back where it was."""
-    values = 10.0 * (1.0 + 0.0028 * np.r_[np.arange(8), np.zeros(8)])
-    stds = np.full(8, 0.04)
-    assert cusum(values[:8], stds).steady
-    found = cusum(values, np.full(16, 0.04))
+    steps = np.concatenate((np.arange(8), np.zeros(8)))
+    values = 10.0 * (1.0 + 0.0028 * steps)
+    stds = np.full(16, STD)
+    on_the_slope = cusum(values[:8], stds[:8])
+    assert on_the_slope.steady
+    found = cusum(values, stds)
     last_alarm = found.alarms[-1]
     assert last_alarm.kind is AlarmKind.TREND
-    expected = (False, None, None, False)
-    assert (found.alarmed, found.alarm, found.onset, found.steady) == expected
-    assert found.baseline == pytest.approx(values[:12].mean())
-    assert found.change_percent == pytest.approx(100.0 * (10.0 / values[:12].mean() - 1.0))
+    _reports_no_change(found)
+    baseline = values[:12].mean()
+    assert found.baseline == pytest.approx(baseline)
+    change = 10.0 / baseline - 1.0
+    assert found.change_percent == pytest.approx(100.0 * change)
 
 
 @settings(max_examples=100, deadline=None)
 @given(st.lists(st.sampled_from([10.0, 10.0, 10.05, 9.95, 10.6, 9.4]), min_size=2, max_size=30))
 def test_an_onset_is_reported_in_alarm_only(values: list[float]) -> None:
-    stds = np.full(len(values), 0.04)
+    stds = np.full(len(values), STD)
     found = cusum(values, stds)
-    assert found.alarmed == (found.onset is not None) == (found.alarm is not None)
+    has_onset = found.onset is not None
+    has_alarm = found.alarm is not None
+    assert has_onset == found.alarmed
+    assert has_alarm == found.alarmed
     if not found.alarmed:
         assert not found.steady
-        smallest = min(len(values) - 1, CHART.baseline)
-        assert found.baseline == pytest.approx(np.mean(values[:smallest]))
+        baseline_count = min(len(values) - 1, CHART.baseline)
+        assert found.baseline == pytest.approx(np.mean(values[:baseline_count]))
 
 
 def test_one_calibration_is_its_own_baseline() -> None:
     found = cusum([5.0], [0.1])
-    expected = (5.0, (), None, 0.0)
-    assert (found.baseline, found.alarms, found.onset, found.change_percent) == expected
+    assert found.baseline == 5.0
+    assert found.alarms == ()
+    assert found.onset is None
+    assert found.change_percent == 0.0
 
 
 @pytest.mark.parametrize(
@@ -384,21 +438,23 @@ def test_numbers_of_any_size_are_watched(values: list[float], stds: list[float])
     """As a file that was made by hand may have them; a warning of numpy would be an error here."""
     (factor,) = dispersions([values], [stds])
     found = cusum(values, stds, dispersion=float(factor))
-    numbers = [found.baseline, found.change_percent, found.change_sigmas]
-    assert all(
-        map(math.isfinite, [*numbers, *found.deviations, *found.upper, *found.lower, *found.trend])
-    )
-    words = decide(("J1",), values[:1], stds[:1], values[1:2], stds[1:2]).words
-    assert len(words) < 120
+    assert math.isfinite(found.baseline)
+    assert math.isfinite(found.change_percent)
+    assert math.isfinite(found.change_sigmas)
+    for path in (found.deviations, found.upper, found.lower, found.trend):
+        assert np.isfinite(path).all()
+    change = decide(("J1",), values[:1], stds[:1], values[1:2], stds[1:2])
+    assert len(change.words) < 120
 
 
-def test_one_sigma_of_any_size_leaves_the_others_their_say() -> None:
-    values = np.r_[np.full(14, 10.0), np.full(6, 9.4)]
-    plain = cusum(values, np.full(20, 0.04))
-    for far in (1e-300, 1e300):
-        stds = np.full(20, 0.04)
-        stds[3] = far
-        assert cusum(values, stds).onset == plain.onset
+@pytest.mark.parametrize("far", [1e-300, 1e300])
+def test_one_sigma_of_any_size_leaves_the_others_their_say(far: float) -> None:
+    values = _step(10.0, 14, 9.4, 6)
+    stds = np.full(20, STD)
+    plain = cusum(values, stds)
+    one_far = stds.copy()
+    one_far[3] = far
+    assert cusum(values, one_far).onset == plain.onset
 
 
 @settings(max_examples=100, deadline=None)
@@ -412,12 +468,13 @@ def test_a_drift_does_not_depend_on_unit_nor_sign(
 ) -> None:
     values, stds = np.array(points).T
     one = cusum(values, stds)
-    other = cusum((-unit if mirrored else unit) * values, unit * stds)
+    sign = -1.0 if mirrored else 1.0
+    other = cusum(sign * unit * values, unit * stds)
     np.testing.assert_allclose(other.upper, one.upper, atol=1e-6)
     np.testing.assert_allclose(other.lower, one.lower, atol=1e-6)
     np.testing.assert_allclose(other.trend, one.trend, atol=1e-6)
-    expected = [alarm.kind for alarm in one.alarms]
-    assert [alarm.kind for alarm in other.alarms] == expected
+    kinds = [alarm.kind for alarm in other.alarms]
+    assert kinds == [alarm.kind for alarm in one.alarms]
     assert other.change_percent == pytest.approx(one.change_percent, abs=1e-6)
 
 
@@ -426,7 +483,7 @@ def test_a_slope_is_reported_along_its_line() -> None:
     the CUSUM's baseline goes with it, the line does not.
     """
     values = -10.0 * (1.0 - 0.0028 * np.arange(8))
-    stds = np.full(8, 0.04)
+    stds = np.full(8, STD)
     found = cusum(values, stds)
     assert found.steady
     assert found.alarmed
@@ -436,11 +493,13 @@ def test_a_slope_is_reported_along_its_line() -> None:
     assert found.baseline == pytest.approx(-10.0)
     assert found.change_percent == pytest.approx(-1.96)
     assert found.change_sigmas == pytest.approx(found.trend[-1])
-    middle, spread = 3.5, 42.0  # of 0 … 7: mean, and sum of squares about it
-    assert found.trend[-1] == pytest.approx(-0.7 * math.sqrt(spread) / DISPERSION)
-    assert found.baseline_std == pytest.approx(
-        DISPERSION * 0.04 * math.sqrt(1 / 8 + middle**2 / spread)
-    )
+    # Of the days 0 … 7: mean, and sum of squares about it.
+    mean_day = 3.5
+    squares = 42.0
+    assert found.trend[-1] == pytest.approx(-0.7 * math.sqrt(squares) / DISPERSION)
+    variance_share = 1 / 8 + mean_day**2 / squares
+    expected_std = DISPERSION * STD * math.sqrt(variance_share)
+    assert found.baseline_std == pytest.approx(expected_std)
 
 
 @pytest.mark.slow
@@ -452,9 +511,12 @@ def test_no_alarm_in_24_recalibrations_without_drift() -> None:
     rng = np.random.default_rng(6)
     shares = false_alarms(rng, 3000, dispersion=1.05)
     assert shares.any <= 1.5
-    assert max(shares.cusum, shares.trend) <= 1.1
+    assert shares.cusum <= 1.1
+    assert shares.trend <= 1.1
     assert shares.single <= 0.3
-    assert false_alarms(np.random.default_rng(7), 1, dispersion=1.05).any == 0.0
+    rng = np.random.default_rng(7)
+    one_draw = false_alarms(rng, 1, dispersion=1.05)
+    assert one_draw.any == 0.0
     assert RECALIBRATIONS == 24
 
 
@@ -487,21 +549,28 @@ def test_a_drift_from_the_first_day_is_found_by_the_line_sooner_than_by_the_sums
     """
     rng = np.random.default_rng(9)
     found = delays(rng, 800, std_percent=std_percent, before=1)
-    share = share_percent(found.any, 2)
-    assert share >= within_two
-    assert share > share_percent(found.cusum, 2) + 10
-    assert share < most_percent(std_percent=std_percent, before=1, false_percent=1.1) < 98
+    by_any = share_percent(found.any, 2)
+    by_cusum = share_percent(found.cusum, 2)
+    assert by_any >= within_two
+    assert by_any > by_cusum + 10
+    most = most_percent(std_percent=std_percent, before=1, false_percent=1.1)
+    assert by_any < most
+    assert most < 98
 
 
-def test_patterns() -> None:
-    std = np.full(6, 0.4)
-    one = np.array([0.1, -0.2, 0.3, -6.0, 0.2, 0.0])
-    alarmed = [False] * 6
-    change_percent = np.zeros(6)
-    assert pattern(change_percent, std, alarmed) is Pattern.NONE
-    assert pattern(one, std, [False, False, False, True, False, False]) is Pattern.ONE
-    several = np.array([0.1, -5.0, 0.3, -6.0, 0.2, 0.0])
-    assert pattern(several, std, np.abs(several) > 4) is Pattern.SEVERAL
-    common = -3.0 + np.array([0.1, -0.2, 0.3, -0.4, 0.2, 0.0])
-    assert pattern(common, std, [True, True, False, True, True, False]) is Pattern.COMMON
-    assert pattern(common, std, [False] * 6) is Pattern.NONE
+@pytest.mark.parametrize(
+    ("change_percent", "alarmed_axes", "expected"),
+    [
+        ([0.0, 0.0, 0.0, 0.0, 0.0, 0.0], [], Pattern.NONE),
+        ([0.1, -0.2, 0.3, -6.0, 0.2, 0.0], [3], Pattern.ONE),
+        ([0.1, -5.0, 0.3, -6.0, 0.2, 0.0], [1, 3], Pattern.SEVERAL),
+        ([-2.9, -3.2, -2.7, -3.4, -2.8, -3.0], [0, 1, 3, 4], Pattern.COMMON),
+        ([-2.9, -3.2, -2.7, -3.4, -2.8, -3.0], [], Pattern.NONE),
+    ],
+)
+def test_pattern_of_changes_is_named(
+    change_percent: list[float], alarmed_axes: list[int], expected: Pattern
+) -> None:
+    std_percent = np.full(6, 0.4)
+    alarmed = np.isin(np.arange(6), alarmed_axes)
+    assert pattern(np.array(change_percent), std_percent, alarmed) is expected

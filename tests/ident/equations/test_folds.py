@@ -24,6 +24,7 @@ from ident.errors import TooFewMoves
 WIDTH = 5
 SEEN = (np.array([0, 2, 3, 4]), np.array([1, 4]), np.array([2, 3]))
 CLUSTERS = 2 * MIN_MOVES_TO_LEAVE_OUT
+SAMPLES = 6 * CLUSTERS
 TORQUE_COLUMNS = 2
 TO_MOTOR = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, -0.5], [0.0, 0.0, 2.0]])
 
@@ -31,22 +32,28 @@ TO_MOTOR = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, -0.5], [0.0, 0.0, 2.0]])
 def made_problem() -> Linearisation:
     """Motor 2 has no row in the first cluster; rows of clusters are mixed, as runs follow."""
     rng = np.random.default_rng(12)
-    cluster = rng.permutation(np.repeat(np.arange(CLUSTERS), 6))
+    in_order = np.repeat(np.arange(CLUSTERS), 6)
+    cluster = rng.permutation(in_order)
     sources = [np.flatnonzero(cluster >= least) for least in (0, 1, 0)]
     counts = [len(source) for source in sources]
-    parts = tuple(
-        rng.normal(size=(len(seen), count)) for seen, count in zip(SEEN, counts, strict=True)
-    )
+    parts = []
+    for seen, count in zip(SEEN, counts, strict=True):
+        parts.append(rng.normal(size=(len(seen), count)))
     source = np.concatenate(sources)
+    residual = rng.normal(size=len(source))
+    current = rng.normal(size=len(source))
+    motor = np.repeat(np.arange(3), counts)
+    gamma = np.array([0.5, -0.2, 1.5])
+    noise = np.array([0.1, 0.3, 0.2])
     return Linearisation(
-        jacobian=Jacobian(parts, SEEN, WIDTH),
-        residual=rng.normal(size=len(source)),
-        current=rng.normal(size=len(source)),
-        motor=np.repeat(np.arange(3), counts),
+        jacobian=Jacobian(tuple(parts), SEEN, WIDTH),
+        residual=residual,
+        current=current,
+        motor=motor,
         cluster=cluster[source],
         source=source,
-        gamma=np.array([0.5, -0.2, 1.5]),
-        noise=np.array([0.1, 0.3, 0.2]),
+        gamma=gamma,
+        noise=noise,
         free=np.arange(WIDTH),
         scale=np.ones(WIDTH),
     )
@@ -82,10 +89,12 @@ def test_rows_are_sorted_by_motor_fold_and_cluster_and_none_is_lost(
     found = folds.linearisation
     keys = list(zip(found.motor, found.cluster % FOLDS, found.cluster, strict=True))
     assert keys == sorted(keys)
-    before = np.column_stack((dense(problem), problem.residual, problem.source, problem.cluster))
-    after = np.column_stack((dense(found), found.residual, found.source, found.cluster))
-    order = np.lexsort((problem.cluster, problem.cluster % FOLDS, problem.motor))
-    assert_allclose(after, before[order])
+    fold = problem.cluster % FOLDS
+    order = np.lexsort((problem.cluster, fold, problem.motor))
+    assert_allclose(dense(found), dense(problem)[order])
+    assert_allclose(found.residual, problem.residual[order])
+    assert_allclose(found.source, problem.source[order])
+    assert_allclose(found.cluster, problem.cluster[order])
     assert folds.count == FOLDS
     assert folds.moves == CLUSTERS
 
@@ -106,14 +115,16 @@ def test_sums_of_clusters_and_motors_are_those_of_their_rows(folds: Folds) -> No
     found = folds.linearisation
     rows = dense(found)
     for cluster in range(CLUSTERS):
-        own = rows[found.cluster == cluster]
+        is_own = found.cluster == cluster
+        own = rows[is_own]
+        score = own.T @ found.residual[is_own]
         assert_allclose(folds.cluster_hessian[cluster], own.T @ own, atol=1e-12)
-        score = own.T @ found.residual[found.cluster == cluster]
         assert_allclose(folds.cluster_score[cluster], score, atol=1e-12)
     for motor in range(3):
-        own = rows[found.motor == motor]
+        is_own = found.motor == motor
+        own = rows[is_own]
+        score = own.T @ found.residual[is_own]
         assert_allclose(folds.motor_hessian[motor], own.T @ own, atol=1e-12)
-        score = own.T @ found.residual[found.motor == motor]
         assert_allclose(folds.motor_score[motor], score, atol=1e-12)
 
 
@@ -123,10 +134,13 @@ def test_a_fold_is_predicted_by_a_fit_of_the_others(folds: Folds) -> None:
     for fold in range(FOLDS):
         left_out = rows_in(folds, fold)
         others = np.setdiff1d(np.arange(len(rows)), left_out)
-        step = np.linalg.lstsq(rows[others], found.residual[others], rcond=None)[0]
-        expected = found.residual[left_out] - rows[left_out] @ step
+        other_rows = rows[others]
+        other_residual = found.residual[others]
+        step = np.linalg.lstsq(other_rows, other_residual, rcond=None)[0]
+        predicted = rows[left_out] @ step
+        expected = found.residual[left_out] - predicted
         assert_allclose(folds.residual[left_out], expected, atol=1e-6)
-        assert_allclose(folds.scores[fold], rows[others].T @ found.residual[others], atol=1e-12)
+        assert_allclose(folds.scores[fold], other_rows.T @ other_residual, atol=1e-12)
 
 
 def test_sums_of_each_fold_and_motor_are_of_predicted_rows(folds: Folds) -> None:
@@ -134,12 +148,14 @@ def test_sums_of_each_fold_and_motor_are_of_predicted_rows(folds: Folds) -> None
     rows = dense(found)
     squares = folds.square_sum(folds.residual)
     for fold in range(FOLDS):
+        in_fold = found.cluster % FOLDS == fold
         for motor in range(3):
-            own = np.flatnonzero((found.cluster % FOLDS == fold) & (found.motor == motor))
-            assert_allclose(folds.part_hessian[fold, motor], rows[own].T @ rows[own], atol=1e-12)
-            score = rows[own].T @ folds.residual[own]
-            assert_allclose(folds.part_score[fold, motor], score, atol=1e-12)
-            assert squares[fold, motor] == pytest.approx(np.sum(folds.residual[own] ** 2))
+            is_own = in_fold & (found.motor == motor)
+            own = rows[is_own]
+            residual = folds.residual[is_own]
+            assert_allclose(folds.part_hessian[fold, motor], own.T @ own, atol=1e-12)
+            assert_allclose(folds.part_score[fold, motor], own.T @ residual, atol=1e-12)
+            assert squares[fold, motor] == pytest.approx(np.sum(residual**2))
 
 
 def test_factors_are_of_all_rows_and_of_those_without_a_fold(folds: Folds) -> None:
@@ -150,8 +166,10 @@ def test_factors_are_of_all_rows_and_of_those_without_a_fold(folds: Folds) -> No
     for fold, (factor, is_lower) in enumerate(folds.factors):
         assert is_lower
         others = np.setdiff1d(np.arange(len(rows)), rows_in(folds, fold))
+        other_rows = rows[others]
+        hessian = other_rows.T @ other_rows
         triangle = np.tril(factor)
-        assert_allclose(triangle @ triangle.T, rows[others].T @ rows[others], rtol=1e-5, atol=1e-4)
+        assert_allclose(triangle @ triangle.T, hessian, rtol=1e-5, atol=1e-4)
     assert folds.estimate_factor is folds.full_factor
 
 
@@ -165,9 +183,11 @@ def test_pieces_of_one_move_are_left_out_together(problem: Linearisation) -> Non
 
 def test_too_few_moves_are_refused_with_their_number(problem: Linearisation) -> None:
     enough = np.minimum(np.arange(CLUSTERS), MIN_MOVES_TO_LEAVE_OUT - 1)
-    assert cut_into_folds(problem, enough).moves == MIN_MOVES_TO_LEAVE_OUT
+    folds = cut_into_folds(problem, enough)
+    assert folds.moves == MIN_MOVES_TO_LEAVE_OUT
     few = np.minimum(np.arange(CLUSTERS), MIN_MOVES_TO_LEAVE_OUT - 2)
-    with pytest.raises(TooFewMoves, match=str(MIN_MOVES_TO_LEAVE_OUT - 1)):
+    number = str(MIN_MOVES_TO_LEAVE_OUT - 1)
+    with pytest.raises(TooFewMoves, match=number):
         cut_into_folds(problem, few)
 
 
@@ -183,7 +203,8 @@ def test_products_over_blocks_are_the_same_for_few_columns_and_many(
     assert found.shape == (len(own.starts), 2, count, count)
     for block, product in enumerate(found):
         part = columns[..., edges[block] : edges[block + 1]]
-        assert_allclose(product, part @ np.swapaxes(part, -1, -2), atol=1e-12)
+        expected = part @ np.swapaxes(part, -1, -2)
+        assert_allclose(product, expected, atol=1e-12)
 
 
 def test_a_best_fit_leaves_nothing_along_its_columns(problem: Linearisation) -> None:
@@ -191,41 +212,49 @@ def test_a_best_fit_leaves_nothing_along_its_columns(problem: Linearisation) -> 
     rows = dense(problem)
     expected = np.linalg.lstsq(rows, problem.residual, rcond=None)[0]
     assert_allclose(step, expected, atol=1e-6)
-    assert_allclose(around.residual, problem.residual - rows @ expected, atol=1e-6)
+    left = problem.residual - rows @ expected
+    assert_allclose(around.residual, left, atol=1e-6)
 
 
 def test_torque_columns_are_whitened_on_the_rows_of_every_motor_that_needs_them(
     problem: Linearisation,
 ) -> None:
     rng = np.random.default_rng(3)
-    torque_nm = rng.normal(size=(3, TORQUE_COLUMNS, 6 * CLUSTERS))
+    torque_nm = rng.normal(size=(3, TORQUE_COLUMNS, SAMPLES))
     found = problem.whitened(torque_nm, TO_MOTOR)
-    for row, (motor, source) in enumerate(zip(problem.motor, problem.source, strict=True)):
+    for row, motor in enumerate(problem.motor):
         # γ (T τ)/σ of the row's motor.
+        source = problem.source[row]
         torque = TO_MOTOR[motor] @ torque_nm[:, :, source]
-        assert_allclose(found[row], torque * problem.gamma[motor] / problem.noise[motor])
-    assert set(problem.felt(torque_nm * [[[0.0]], [[1.0]], [[0.0]]], TO_MOTOR)) == {1}
+        expected = torque * problem.gamma[motor] / problem.noise[motor]
+        assert_allclose(found[row], expected)
+    of_second_joint = np.zeros_like(torque_nm)
+    of_second_joint[1] = torque_nm[1]
+    motors = problem.felt(of_second_joint, TO_MOTOR)
+    assert set(motors) == {1}
 
 
 def test_rows_of_a_motor_and_clusters_are_counted(problem: Linearisation) -> None:
     assert problem.cluster_count == CLUSTERS
-    assert problem.rows_of(1) == slice(6 * CLUSTERS, 12 * CLUSTERS - 6)
-    assert problem.shown(1) == 6 * CLUSTERS - 6
-    per_row = np.zeros(6 * CLUSTERS, dtype=np.int64)
+    assert problem.rows_of(1) == slice(SAMPLES, 2 * SAMPLES - 6)
+    assert problem.shown(1) == SAMPLES - 6
+    per_row = np.zeros(SAMPLES, dtype=np.int64)
     per_row[problem.source] = 10 * problem.cluster
-    assert problem.of_clusters(per_row).tolist() == [10 * number for number in range(CLUSTERS)]
+    of_clusters = problem.of_clusters(per_row)
+    assert of_clusters.tolist() == [10 * number for number in range(CLUSTERS)]
 
 
 def test_errors_that_a_run_shares_are_taken_out_and_put_back(problem: Linearisation) -> None:
     rng = np.random.default_rng(5)
-    deviations = rng.normal(size=(3, 1, 6 * CLUSTERS))
-    run = np.arange(6 * CLUSTERS) % 2
+    deviations = rng.normal(size=(3, 1, SAMPLES))
+    run = np.arange(SAMPLES) % 2
     beside = problem.beside_scatter(deviations, np.eye(3), run)
     rows = dense(problem)
+    whitened = problem.whitened(deviations, np.eye(3))
     for motor in range(3):
         own = problem.rows_of(motor)
         of_run = run[problem.source[own]]
-        deviation = problem.whitened(deviations, np.eye(3))[own, 0]
+        deviation = whitened[own, 0]
         covariance = np.eye(len(deviation))
         for number in (0, 1):
             shared = deviation * (of_run == number)
@@ -235,35 +264,43 @@ def test_errors_that_a_run_shares_are_taken_out_and_put_back(problem: Linearisat
         assert_allclose(dense(beside)[own], root @ rows[own], atol=1e-9)
         assert_allclose(beside.residual[own], root @ problem.residual[own], atol=1e-9)
         given = rng.normal(size=len(problem.motor))
-        assert_allclose(beside.decorrelated(given)[own], root @ given[own], atol=1e-9)
-        assert_allclose(beside.correlated(given)[own], covariance @ given[own], atol=1e-9)
+        decorrelated = beside.decorrelated(given)
+        correlated = beside.correlated(given)
+        assert_allclose(decorrelated[own], root @ given[own], atol=1e-9)
+        assert_allclose(correlated[own], covariance @ given[own], atol=1e-9)
     assert problem.decorrelated(given) is given
     assert problem.correlated(given) is given
 
 
 def test_candidates_are_decorrelated_together_as_each_alone(problem: Linearisation) -> None:
     rng = np.random.default_rng(6)
-    deviations = rng.normal(size=(3, 1, 6 * CLUSTERS))
-    beside = problem.beside_scatter(deviations, np.eye(3), np.arange(6 * CLUSTERS) % 2)
+    deviations = rng.normal(size=(3, 1, SAMPLES))
+    run = np.arange(SAMPLES) % 2
+    beside = problem.beside_scatter(deviations, np.eye(3), run)
     scatter = beside.scatter
     assert scatter is not None
-    sizes = [problem.rows_of(motor).stop - problem.rows_of(motor).start for motor in range(3)]
-    each = [
-        {0: rng.normal(size=(2, sizes[0]))},
-        {},
-        {0: rng.normal(size=(1, sizes[0])), 2: rng.normal(size=(3, sizes[2]))},
-    ]
+    rows_of_first = np.count_nonzero(problem.motor == 0)
+    rows_of_last = np.count_nonzero(problem.motor == 2)
+    on_one_motor = {0: rng.normal(size=(2, rows_of_first))}
+    on_none = dict[int, FloatArray]()
+    on_two_motors = {
+        0: rng.normal(size=(1, rows_of_first)),
+        2: rng.normal(size=(3, rows_of_last)),
+    }
+    each = [on_one_motor, on_none, on_two_motors]
     found = beside.decorrelated_by_motor(each)
     assert [set(one) for one in found] == [{0}, set(), {0, 2}]
     for one, by_motor in zip(found, each, strict=True):
         for motor, columns in by_motor.items():
-            assert_allclose(one[motor], scatter.decorrelate(motor, columns), atol=1e-12)
+            alone = scatter.decorrelate(motor, columns)
+            assert_allclose(one[motor], alone, atol=1e-12)
 
 
 def test_the_estimates_factor_is_of_rows_that_share_no_errors(problem: Linearisation) -> None:
     rng = np.random.default_rng(7)
-    deviations = rng.normal(size=(3, 1, 6 * CLUSTERS))
-    beside = problem.beside_scatter(deviations, np.eye(3), np.arange(6 * CLUSTERS) % 2)
+    deviations = rng.normal(size=(3, 1, SAMPLES))
+    run = np.arange(SAMPLES) % 2
+    beside = problem.beside_scatter(deviations, np.eye(3), run)
     folds = cut_into_folds(beside)
     lower = np.tril(folds.estimate_factor[0])
     rows = dense(problem)
@@ -272,13 +309,15 @@ def test_the_estimates_factor_is_of_rows_that_share_no_errors(problem: Linearisa
 
 def test_preload_mixes_the_torques_of_all_joints_row_by_row(problem: Linearisation) -> None:
     rng = np.random.default_rng(8)
-    transform = rng.normal(size=(6 * CLUSTERS, 3, 3))
+    transform = rng.normal(size=(SAMPLES, 3, 3))
     mixed = replace(problem, transform=transform)
-    torque_nm = rng.normal(size=(3, TORQUE_COLUMNS, 6 * CLUSTERS))
+    torque_nm = rng.normal(size=(3, TORQUE_COLUMNS, SAMPLES))
     found = mixed.whitened(torque_nm, TO_MOTOR)
-    for row in (0, 6 * CLUSTERS + 3, len(problem.motor) - 1):
+    last_row = len(problem.motor) - 1
+    for row in (0, SAMPLES + 3, last_row):
         source = problem.source[row]
-        expected = transform[source, problem.motor[row]] @ torque_nm[:, :, source]
+        of_motor = transform[source, problem.motor[row]]
+        expected = of_motor @ torque_nm[:, :, source]
         assert_allclose(found[row], expected)
     rows = mixed.rows_of(2)
     diagonal = transform[problem.source[rows], 2, 2]

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from numpy.typing import NDArray
 from scipy import signal
 
+from ident.arrays import FloatArray
 from ident.data.run import Run
 from ident.discovery.evidence import Evidence, gather
 from ident.equations.linearisation import (
@@ -36,12 +36,13 @@ def test_jacobian_is_the_slope_of_the_residual(
     parameters = start.estimate.parameters
     noise = np.full(6, 0.1)
 
-    def problem(
-        step: np.ndarray[tuple[int], np.dtype[np.float64]],
-    ) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
-        return linearise(
-            start.training, gains + step[:6], parameters + step[6:], noise, gains_fixed=False
-        ).residual
+    def residual_after(step: FloatArray) -> FloatArray:
+        changed_gains = gains + step[:6]
+        changed_parameters = parameters + step[6:]
+        changed = linearise(
+            start.training, changed_gains, changed_parameters, noise, gains_fixed=False
+        )
+        return changed.residual
 
     around = linearise(start.training, gains, parameters, noise, gains_fixed=False)
     rng = np.random.default_rng(0)
@@ -49,46 +50,57 @@ def test_jacobian_is_the_slope_of_the_residual(
         scaled = 1e-6 * rng.normal(size=len(around.free))
         step = np.zeros(6 + len(parameters))
         step[around.free] = scaled * around.scale
-        slope = (problem(step) - problem(-step)) / 2.0
-        assert_allclose(
-            -slope, around.jacobian @ scaled, rtol=0.0, atol=1e-4 * np.max(np.abs(slope))
-        )
+        slope = (residual_after(step) - residual_after(-step)) / 2.0
+        expected = around.jacobian @ scaled
+        tolerance = 1e-4 * np.max(np.abs(slope))
+        assert_allclose(-slope, expected, rtol=0.0, atol=tolerance)
 
 
 def test_a_jacobian_in_parts_is_the_whole_one() -> None:
     """Products, some of its columns, and all of them; each motor holds unknowns of its own."""
     rng = np.random.default_rng(7)
-    seen = (np.array([0, 2, 3, 4]), np.array([1, 4]), np.array([], dtype=np.int64))
-    parts = tuple(
-        rng.normal(size=(len(held), rows)) for held, rows in zip(seen, (6, 9, 3), strict=True)
-    )
+    first_seen = np.array([0, 2, 3, 4])
+    second_seen = np.array([1, 4])
+    third_seen = np.array([], dtype=np.int64)
+    first_part = rng.normal(size=(4, 6))
+    second_part = rng.normal(size=(2, 9))
+    third_part = rng.normal(size=(0, 3))
+    parts = (first_part, second_part, third_part)
+    seen = (first_seen, second_seen, third_seen)
     jacobian = Jacobian(parts, seen, 5)
     whole = np.zeros((18, 5))
-    whole[:6, seen[0]], whole[6:15, seen[1]] = parts[0].T, parts[1].T
+    whole[:6, first_seen] = first_part.T
+    whole[6:15, second_seen] = second_part.T
     step = rng.normal(size=5)
     columns = rng.normal(size=(18, 2))
     assert jacobian @ step == pytest.approx(whole @ step)
     assert jacobian.on_columns(columns) == pytest.approx(whole.T @ columns)
-    assert jacobian.on_columns(columns[:, 0]) == pytest.approx(whole.T @ columns[:, 0])
+    one_column = columns[:, 0]
+    assert jacobian.on_columns(one_column) == pytest.approx(whole.T @ one_column)
     chosen = np.array([1, 3, 4])
-    assert np.array_equal(jacobian.columns(chosen), whole[:, chosen])
-    assert jacobian.only(chosen) @ step[chosen] == pytest.approx(whole[:, chosen] @ step[chosen])
+    chosen_columns = whole[:, chosen]
+    chosen_step = step[chosen]
+    assert np.array_equal(jacobian.columns(chosen), chosen_columns)
+    assert jacobian.only(chosen) @ chosen_step == pytest.approx(chosen_columns @ chosen_step)
 
 
 def _lines(motor: list[int], cluster: list[int], source: list[int]) -> Linearisation:
     """Rows of two motors without any unknown."""
     rows = len(motor)
-    nothing = np.zeros((0, rows))
+    part = np.zeros((0, rows))
+    no_unknown = np.zeros(0, dtype=np.int64)
+    gamma = np.array([0.5, 0.2])
+    noise = np.array([0.1, 0.3])
     return Linearisation(
-        jacobian=Jacobian((nothing,), (np.zeros(0, dtype=np.int64),), 0),
+        jacobian=Jacobian((part,), (no_unknown,), 0),
         residual=np.zeros(rows),
         current=np.ones(rows),
         motor=np.array(motor),
         cluster=np.array(cluster),
         source=np.array(source),
-        gamma=np.array([0.5, 0.2]),
-        noise=np.array([0.1, 0.3]),
-        free=np.zeros(0, dtype=np.int64),
+        gamma=gamma,
+        noise=noise,
+        free=no_unknown,
         scale=np.zeros(0),
     )
 
@@ -98,9 +110,12 @@ def test_clusters_and_rows_of_a_motor_are_counted_over_all_motors() -> None:
     lines = _lines(motor=[0, 0, 0, 1, 1], cluster=[0, 0, 1, 1, 2], source=[0, 2, 4, 5, 7])
     assert lines.cluster_count == 3
     run_of_row = np.array([3, 3, 3, 3, 8, 8, 8, 9])
-    assert lines.of_clusters(run_of_row).tolist() == [3, 8, 9]
-    assert [lines.rows_of(motor) for motor in (0, 1)] == [slice(0, 3), slice(3, 5)]
-    assert [lines.shown(motor) for motor in (0, 1)] == [3.0, 2.0]
+    run_of_cluster = lines.of_clusters(run_of_row)
+    assert run_of_cluster.tolist() == [3, 8, 9]
+    assert lines.rows_of(0) == slice(0, 3)
+    assert lines.rows_of(1) == slice(3, 5)
+    assert lines.shown(0) == 3.0
+    assert lines.shown(1) == 2.0
 
 
 def test_what_internal_preload_hides_is_not_shown() -> None:
@@ -123,19 +138,21 @@ def test_a_shift_is_that_of_the_fit_without_the_cluster() -> None:
     estimate = np.linalg.lstsq(rows, whole, rcond=None)[0]
     around = residual - jacobian @ estimate
     grams = np.einsum("mri,mrj->mij", jacobian, jacobian)
-    shifts = left_out_shifts(grams, np.einsum("mri,mr->mi", jacobian, around))
+    scores = np.einsum("mri,mr->mi", jacobian, around)
+    shifts = left_out_shifts(grams, scores)
+    tolerance = 1e-9 * np.abs(estimate).max()
     for cluster, shift in enumerate(shifts):
-        kept = np.arange(10) != cluster
-        without = np.linalg.lstsq(
-            jacobian[kept].reshape(-1, 4), residual[kept].ravel(), rcond=None
-        )[0]
-        assert shift == pytest.approx(
-            without - estimate, rel=1e-6, abs=1e-9 * np.abs(estimate).max()
-        )
+        others = np.arange(10) != cluster
+        other_rows = jacobian[others].reshape(-1, 4)
+        other_residual = residual[others].ravel()
+        without = np.linalg.lstsq(other_rows, other_residual, rcond=None)[0]
+        assert shift == pytest.approx(without - estimate, rel=1e-6, abs=tolerance)
 
 
 def test_a_direction_that_one_cluster_alone_has_seen_stays() -> None:
-    grams = np.stack([np.diag([1.0, 1.0]), *(np.diag([1.0, 0.0]) for _ in range(3))])
+    both = np.diag([1.0, 1.0])
+    first_only = np.diag([1.0, 0.0])
+    grams = np.stack([both, first_only, first_only, first_only])
     scores = np.array([[0.3, 0.0], [-0.1, 0.0], [-0.1, 0.0], [-0.1, 0.0]])
     assert left_out_shifts(grams, scores) == pytest.approx(-scores / 3.0)
 
@@ -145,11 +162,18 @@ def test_the_triangle_of_rows_has_their_jacobian(truth: Truth) -> None:
     rows = rng.normal(size=(40, 7))
     parameters = rng.normal(size=5)
     noise = rng.uniform(0.1, 1.0, 6)
-    products = []
-    for part in (rows, np.asarray(np.linalg.qr(rows, mode="r"))):
+    triangle = np.asarray(np.linalg.qr(rows, mode="r"))
+
+    def normal_equations(part: FloatArray) -> FloatArray:
         jacobian, residual = motor_jacobian(part, 2, truth.gains, parameters, noise)
-        products.append(np.column_stack((jacobian.T @ jacobian, jacobian.T @ residual)))
-    assert products[0] == pytest.approx(products[1], abs=1e-10 * np.abs(products[0]).max())
+        gram = jacobian.T @ jacobian
+        score = jacobian.T @ residual
+        return np.column_stack((gram, score))
+
+    of_rows = normal_equations(rows)
+    of_triangle = normal_equations(triangle)
+    tolerance = 1e-10 * np.abs(of_rows).max()
+    assert of_rows == pytest.approx(of_triangle, abs=tolerance)
 
 
 @pytest.mark.slow
@@ -177,11 +201,10 @@ def test_sums_of_clusters_are_those_of_each_clusters_own_rows(
             _, residual = motor_jacobian(own_rows, motor, *around)
             gram += jacobian.T @ jacobian
             score += jacobian.T @ residual
-        assert grams[index] == pytest.approx(gram, rel=1e-9, abs=1e-9 * np.abs(gram).max())
-        assert scores[index] == pytest.approx(score, rel=1e-9, abs=1e-9 * np.abs(score).max())
-
-
-FloatArray = NDArray[np.float64]
+        largest_product = np.abs(gram).max()
+        largest_score = np.abs(score).max()
+        assert grams[index] == pytest.approx(gram, rel=1e-9, abs=1e-9 * largest_product)
+        assert scores[index] == pytest.approx(score, rel=1e-9, abs=1e-9 * largest_score)
 
 
 def _slow_line(
@@ -193,32 +216,40 @@ def _slow_line(
     rows = np.arange(6000)
     turns = rng.uniform(1e-3, 2.5e-2, 5)
     phase = rng.uniform(0.0, 6.0, 5)
-    jacobian = np.column_stack((np.ones(len(rows)), np.sin(np.outer(rows, turns) + phase)))
+    angles = np.outer(rows, turns) + phase
+    jacobian = np.column_stack((np.ones(len(rows)), np.sin(angles)))
     keep = np.exp(-1.0 / correlation_rows) if correlation_rows else 0.0
-    noise = signal.lfilter(
-        [np.sqrt(1.0 - keep**2)], [1.0, -keep], rng.standard_normal(len(rows) + 1000)
-    )[1000:]
+    settling_rows = 1000
+    white = rng.standard_normal(len(rows) + settling_rows)
+    new_share = np.sqrt(1.0 - keep**2)
+    correlated = signal.lfilter([new_share], [1.0, -keep], white)
+    noise = correlated[settling_rows:]
     estimate = np.linalg.lstsq(jacobian, noise, rcond=None)[0]
+    residual = noise - jacobian @ estimate
     parts = jacobian.reshape(-1, 50, 6)
-    left = (noise - jacobian @ estimate).reshape(-1, 50)
-    return estimate, np.einsum("mri,mrj->mij", parts, parts), np.einsum("mri,mr->mi", parts, left)
+    left = residual.reshape(-1, 50)
+    grams = np.einsum("mri,mrj->mij", parts, parts)
+    scores = np.einsum("mri,mr->mi", parts, left)
+    return estimate, grams, scores
 
 
 def _std(grams: FloatArray, scores: FloatArray) -> FloatArray:
     shifts = left_out_shifts(grams, scores)
     blocks = len(grams)
-    return np.asarray(
-        np.sqrt((blocks - 1) / blocks * np.sum((shifts - shifts.mean(axis=0)) ** 2, axis=0))
-    )
+    deviations = shifts - shifts.mean(axis=0)
+    squares = np.sum(deviations**2, axis=0)
+    return np.asarray(np.sqrt((blocks - 1) / blocks * squares))
 
 
 def test_clusters_with_independent_noise_stay_as_they_are() -> None:
     runs = np.repeat([0, 1, 2], 40)
-    kept = 0
+    unjoined = 0
     for seed in range(20):
-        _, grams, scores = _slow_line(np.random.default_rng(seed), 0.0)
-        kept += len(independent_blocks(grams, scores, runs)) == len(grams)
-    assert kept >= 19
+        rng = np.random.default_rng(seed)
+        _, grams, scores = _slow_line(rng, 0.0)
+        blocks = independent_blocks(grams, scores, runs)
+        unjoined += len(blocks) == len(grams)
+    assert unjoined >= 19
 
 
 def test_clusters_within_one_correlation_time_are_joined_until_sigma_is_true() -> None:
@@ -229,28 +260,34 @@ def test_clusters_within_one_correlation_time_are_joined_until_sigma_is_true() -
     plain = []
     joined = []
     for seed in range(60):
-        estimate, grams, scores = _slow_line(np.random.default_rng(seed), 150.0)
+        rng = np.random.default_rng(seed)
+        estimate, grams, scores = _slow_line(rng, 150.0)
         starts = independent_blocks(grams, scores, runs)
         assert len(starts) >= MIN_MOVES_TO_LEAVE_OUT
         assert {0, 60} <= set(starts)
         plain.append(estimate / _std(grams, scores))
-        joined.append(
-            estimate / _std(np.add.reduceat(grams, starts), np.add.reduceat(scores, starts))
-        )
-    assert np.sqrt(np.mean(np.square(plain))) > 1.6
-    assert np.sqrt(np.mean(np.square(joined))) < 1.3
+        joined_grams = np.add.reduceat(grams, starts)
+        joined_scores = np.add.reduceat(scores, starts)
+        joined.append(estimate / _std(joined_grams, joined_scores))
+    rms_of_plain = np.sqrt(np.mean(np.square(plain)))
+    rms_of_joined = np.sqrt(np.mean(np.square(joined)))
+    assert rms_of_plain > 1.6
+    assert rms_of_joined < 1.3
 
 
 def test_clusters_of_different_runs_are_never_joined() -> None:
-    _, grams, scores = _slow_line(np.random.default_rng(1), 150.0)
-    assert len(independent_blocks(grams, scores, np.arange(len(grams)))) == len(grams)
+    rng = np.random.default_rng(1)
+    _, grams, scores = _slow_line(rng, 150.0)
+    run_of_cluster = np.arange(len(grams))
+    blocks = independent_blocks(grams, scores, run_of_cluster)
+    assert len(blocks) == len(grams)
 
 
 def test_one_move_fewer_than_can_be_left_out_is_refused_with_their_number(noisy: Evidence) -> None:
     system = noisy.training.system()
-    few = replace(system, clusters=system.clusters[: MIN_MOVES_TO_LEAVE_OUT - 1])
+    count = MIN_MOVES_TO_LEAVE_OUT - 1
+    few = replace(system, clusters=system.clusters[:count])
     estimate = noisy.estimate
-    with pytest.raises(TooFewMoves, match=f"{MIN_MOVES_TO_LEAVE_OUT - 1}"):
-        jackknife_covariance(
-            few, estimate.gains, estimate.parameters, estimate.axis_noise, gains_fixed=False
-        )
+    around = (estimate.gains, estimate.parameters, estimate.axis_noise)
+    with pytest.raises(TooFewMoves, match=f"{count}"):
+        jackknife_covariance(few, *around, gains_fixed=False)

@@ -4,8 +4,8 @@ none is named in clean recordings.
 
 from __future__ import annotations
 
-import itertools
 import re
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -21,6 +21,7 @@ from ident.errors import (
     GAIN_UNSEEN,
     CurrentReversed,
     CurrentUnsigned,
+    Diagnosis,
     ModelContradicted,
     PayloadDiffers,
     UnitsMistaken,
@@ -57,6 +58,9 @@ from tests.ident.recordings import MOUNTED, FloatArray, Truth, record
 
 pytestmark = pytest.mark.slow
 
+NOTHING = 0.0 * BODY
+"""Parameters of a payload that was left off."""
+
 
 @pytest.fixture(scope="module")
 def clean(small_truth: Truth) -> list[Run]:
@@ -68,13 +72,12 @@ def test_nothing_is_named_in_clean_recordings(small_truth: Truth, seed: int) -> 
     noise_a = (0.02, 0.1, 0.15)[seed % 3]
     runs = small_recordings(small_truth, seed, count=3, noise_a=noise_a)
     limit = np.full(3, 99.0)
-    assert diagnosed(small_truth, runs[:2], runs[2:], effort_limit=limit) == ()
-    assert (
-        diagnosed(
-            small_truth, runs[1:], runs[:1], fixed=True, method=Method.WLS, effort_limit=limit
-        )
-        == ()
+    by_ml = diagnosed(small_truth, runs[:2], runs[2:], effort_limit=limit)
+    assert by_ml == ()
+    by_wls = diagnosed(
+        small_truth, runs[1:], runs[:1], fixed=True, method=Method.WLS, effort_limit=limit
     )
+    assert by_wls == ()
     assert exchanged_channels(small_truth.model, runs[:2], SMALL, AXES) is None
 
 
@@ -82,8 +85,9 @@ def test_a_payload_turned_in_one_run_of_three(small_truth: Truth) -> None:
     bodies = {3: turned(np.pi)}
     runs = small_recordings(small_truth, 0, count=6, bodies=bodies)
     (found,) = diagnosed(small_truth, runs)
-    expected = ("payload-differs", ("r3",), ())
-    assert (found.name, found.runs, found.axes) == expected
+    assert found.name == "payload-differs"
+    assert found.runs == ("r3",)
+    assert found.axes == ()
     assert "not turned?" in found.text
 
 
@@ -91,22 +95,25 @@ def test_of_two_loaded_runs_neither_can_be_blamed_alone(small_truth: Truth) -> N
     bodies = {1: turned(np.pi)}
     runs = small_recordings(small_truth, 1, bodies=bodies)
     (found,) = diagnosed(small_truth, runs, fixed=True)
-    expected = ("payload-differs", ("r1", "r3"))
-    assert (found.name, found.runs) == expected
+    assert found.name == "payload-differs"
+    assert found.runs == ("r1", "r3")
 
 
 def test_a_payload_turned_in_the_held_out_run(small_truth: Truth) -> None:
     bodies = {3: turned(np.pi)}
     runs = small_recordings(small_truth, 2, bodies=bodies)
     (found,) = diagnosed(small_truth, runs[:2], runs[2:])
-    assert (found.name, found.runs) == ("payload-differs", ("r3",))
+    assert found.name == "payload-differs"
+    assert found.runs == ("r3",)
 
 
-@pytest.mark.parametrize("left_on", [False, True])
+@pytest.mark.parametrize(
+    ("run", "body"),
+    [pytest.param(3, NOTHING, id="left off"), pytest.param(2, BODY, id="left on")],
+)
 def test_a_payload_left_off_or_on_in_one_run_leaves_no_numbers(
-    small_truth: Truth, left_on: bool
+    small_truth: Truth, run: int, body: FloatArray
 ) -> None:
-    run, body = (2, BODY) if left_on else (3, 0.0 * BODY)
     runs = small_recordings(small_truth, 0, count=6, bodies={run: body})
     with pytest.raises(PayloadDiffers, match=rf"run r{run}: .*was it mounted in this run"):
         diagnosed(small_truth, runs, fixed=True)
@@ -117,37 +124,44 @@ def test_the_only_loaded_run_without_its_payload(small_truth: Truth) -> None:
     a weight of nearly nothing does.
     """
     runs = small_recordings(small_truth, 0, count=2)
-    off = np.array([1.2, 0.85, 1.1])
-    assert diagnosed(small_truth, with_currents(runs, off), fixed=True) == ()
-    bodies = {1: 0.0 * BODY}
-    forgotten = [runs[0], small_recordings(small_truth, 0, count=2, bodies=bodies)[1]]
-    (found,) = diagnosed(small_truth, forgotten, fixed=True)
-    assert (found.name, found.runs) == ("payload-differs", ("r1",))
+    gains_off = with_currents(runs, np.array([1.2, 0.85, 1.1]))
+    assert diagnosed(small_truth, gains_off, fixed=True) == ()
+    without_payload = _second_run_without_payload(small_truth)
+    (found,) = diagnosed(small_truth, [runs[0], without_payload], fixed=True)
+    assert found.name == "payload-differs"
+    assert found.runs == ("r1",)
+
+
+def _second_run_without_payload(truth: Truth) -> Run:
+    """The run that says that it is loaded, and is not."""
+    _, second = small_recordings(truth, 0, count=2, bodies={1: NOTHING})
+    return second
 
 
 def test_the_difference_is_estimated_as_planted(small_truth: Truth) -> None:
     """Twice the mass, at the same centre."""
-    heavier = BODY * np.r_[np.ones(6), np.full(4, 2.0)]
+    heavier = BODY.copy()
+    heavier[6:] *= 2.0
     runs = small_recordings(small_truth, 4, bodies={3: heavier}, noise_a=0.02)
-    known = identify(
-        small_truth.model, runs[:2], SMALL, holdout=runs[3:], fixed_gains=small_truth.gains
-    )
+    gains = small_truth.gains
+    known = identify(small_truth.model, runs[:2], SMALL, holdout=runs[3:], fixed_gains=gains)
     assert known.holdout is not None
-    (found,) = payload_differences(known.holdout, known.estimate.gains, known.estimate.parameters)
+    estimate = known.estimate
+    (found,) = payload_differences(known.holdout, estimate.gains, estimate.parameters)
     seen = [6, 8, 9]  # my lies along the last axis, which is horizontal
     assert found.difference[seen] == pytest.approx(BODY[seen], rel=0.1)
     assert found.probability < 1e-6
 
 
-@pytest.mark.parametrize("order", [*map(list, itertools.permutations(range(3)))][1:], ids=str)
+@pytest.mark.parametrize("order", [[0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0]], ids=str)
 def test_exchanged_currents_are_named(
     small_truth: Truth, clean: list[Run], order: list[int]
 ) -> None:
     runs = with_currents(clean[:2], 1.0, order)
     found = exchanged_channels(small_truth.model, runs, SMALL, AXES)
     assert found is not None
-    expected = tuple(name for name, place in zip(AXES, order, strict=True) if AXES[place] != name)
-    assert found.axes == expected
+    exchanged = [AXES[axis] for axis, channel in enumerate(order) if channel != axis]
+    assert found.axes == tuple(exchanged)
 
 
 def test_one_motor_that_explains_another_current_better_is_no_exchange(
@@ -158,10 +172,11 @@ def test_one_motor_that_explains_another_current_better_is_no_exchange(
     """
     mixed = []
     for run in clean[:2]:
-        current = run.current_a.copy()
-        current[:, 2] = current[:, 1] + 0.3 * current[:, 2]
-        current[:, 1] += 2.0 * np.random.default_rng(3).standard_normal(len(current))
-        mixed.append(replace(run, current_a=current))
+        rng = np.random.default_rng(3)
+        current_a = run.current_a.copy()
+        current_a[:, 2] = current_a[:, 1] + 0.3 * current_a[:, 2]
+        current_a[:, 1] += 2.0 * rng.standard_normal(len(current_a))
+        mixed.append(replace(run, current_a=current_a))
     errors = channel_errors(small_truth.model, mixed, SMALL)
     assert errors[1, 2] < errors[1, 1]
     assert exchanged_channels(small_truth.model, mixed, SMALL, AXES) is None
@@ -170,7 +185,8 @@ def test_one_motor_that_explains_another_current_better_is_no_exchange(
 def test_a_reversed_current_only_turns_a_free_gain(small_truth: Truth, clean: list[Run]) -> None:
     runs = with_currents(clean, np.array([1.0, -1.0, 1.0]))
     (found,) = diagnosed(small_truth, runs)
-    assert (found.name, found.axes) == ("current-reversed", ("J2",))
+    assert found.name == "current-reversed"
+    assert found.axes == ("J2",)
     assert "position" not in found.remedy
 
 
@@ -182,65 +198,78 @@ def test_a_reversed_position_of_a_vertical_axis_is_not_blamed_on_its_current_alo
     mirrored = [replace(run, position_rad=run.position_rad * signs) for run in clean]
     for runs in (mirrored, with_currents(clean, signs)):
         (found,) = diagnosed(small_truth, runs)
-        assert (found.name, found.axes) == ("current-reversed", ("J1",))
+        assert found.name == "current-reversed"
+        assert found.axes == ("J1",)
         assert "this current the other way? If not, does the position" in found.remedy
 
 
 @pytest.mark.parametrize(
-    "signs", [s for s in itertools.product((1.0, -1.0), repeat=3) if 0 < s.count(-1.0) < 3]
+    ("signs", "named"),
+    [
+        ([1.0, 1.0, -1.0], "wrist"),
+        ([1.0, -1.0, 1.0], "arm"),
+        ([1.0, -1.0, -1.0], "arm, wrist"),
+        ([-1.0, 1.0, 1.0], "base"),
+        ([-1.0, 1.0, -1.0], "base, wrist"),
+        ([-1.0, -1.0, 1.0], "base, arm"),
+    ],
 )
 def test_a_reversed_current_with_fixed_gains(
-    small_truth: Truth, clean: list[Run], signs: tuple[float, ...]
+    small_truth: Truth, clean: list[Run], signs: list[float], named: str
 ) -> None:
     axes = ("base", "arm", "wrist")  # not the joints' names in the URDF
-    names = [axis for axis, sign in zip(axes, signs, strict=True) if sign < 0.0]
     runs = with_currents(clean[:1], np.array(signs))
-    with pytest.raises(CurrentReversed, match=f"axis {', '.join(names)}: "):
-        identify(
-            small_truth.model,
-            runs,
-            SMALL,
-            fixed_gains=small_truth.gains,
-            method=Method.WLS,
-            axes=axes,
-        )
+    model = small_truth.model
+    gains = small_truth.gains
+    with pytest.raises(CurrentReversed, match=f"axis {named}: "):
+        identify(model, runs, SMALL, fixed_gains=gains, method=Method.WLS, axes=axes)
 
 
-@pytest.mark.parametrize("fixed", [False, True])
-@pytest.mark.parametrize(("current", "mass"), [(1000.0, 1.0), (1.0, 1000.0)], ids=["mA", "grams"])
-def test_a_unit_is_named(
-    small_truth: Truth, clean: list[Run], current: float, mass: float, fixed: bool
+@pytest.mark.parametrize(
+    ("fixed", "words"),
+    [(False, "all drive gains.*mA"), (True, "the weight of the payload.*mA")],
+)
+def test_currents_in_milliamperes_are_named(
+    small_truth: Truth, clean: list[Run], fixed: bool, words: str
 ) -> None:
-    known = {"m": mass * MOUNTED.known["m"]}
-    heavy = replace(MOUNTED, known=known)
-    runs = [
-        replace(run, payload=run.payload and heavy) for run in with_currents(clean[:2], current)
-    ]
-    if fixed:
-        subject = "the weight of the payload"
-    else:
-        subject = "all drive gains"
-    with pytest.raises(
-        UnitsMistaken, match=f"{subject}.*{'mA' if fixed or current > 1.0 else 'g and read as kg'}"
-    ):
+    runs = with_currents(clean[:2], 1000.0)
+    with pytest.raises(UnitsMistaken, match=words):
         diagnosed(small_truth, runs, fixed=fixed)
+
+
+@pytest.mark.parametrize(
+    ("fixed", "words"),
+    [(False, "all drive gains.*g and read as kg"), (True, "the weight of the payload.*mA")],
+)
+def test_a_mass_in_grams_is_named(
+    small_truth: Truth, clean: list[Run], fixed: bool, words: str
+) -> None:
+    bare, loaded = clean[:2]
+    known = {"m": 1000.0 * MOUNTED.known["m"]}
+    heavy = replace(loaded, payload=replace(MOUNTED, known=known))
+    with pytest.raises(UnitsMistaken, match=words):
+        diagnosed(small_truth, [bare, heavy], fixed=fixed)
 
 
 @given(st.lists(st.floats(0.001, 1000.0), min_size=2, max_size=5))
 def test_all_gains_must_be_off_alike(ratio: list[float]) -> None:
-    gains = np.array(ratio) * (-1.0) ** np.arange(len(ratio))
-    if min(ratio) > UNIT_RATIO or max(ratio) < 1.0 / UNIT_RATIO:
-        nameplate = np.ones(len(ratio))
+    signs = (-1.0) ** np.arange(len(ratio))
+    gains = np.array(ratio) * signs
+    nameplate = np.ones(len(ratio))
+    all_above = min(ratio) > UNIT_RATIO
+    all_below = max(ratio) < 1.0 / UNIT_RATIO
+    if all_above or all_below:
         with pytest.raises(UnitsMistaken):
             require_units(gains, nameplate)
     else:
-        require_units(gains, np.ones(len(ratio)))
+        require_units(gains, nameplate)
 
 
 def test_one_gain_off_its_nameplate(small_truth: Truth, clean: list[Run]) -> None:
     runs = with_currents(clean, np.array([1.0, 1.0, 5.0]))
     (found,) = diagnosed(small_truth, runs)
-    assert (found.name, found.axes) == ("gain-off-nameplate", ("J3",))
+    assert found.name == "gain-off-nameplate"
+    assert found.axes == ("J3",)
     assert "or a length of the URDF wrong? measure the lengths" in found.remedy
 
 
@@ -256,31 +285,32 @@ def test_torques_above_the_limits_of_the_urdf(small_truth: Truth, clean: list[Ru
 
 def test_an_error_on_one_axis(small_truth: Truth, clean: list[Run]) -> None:
     rng = np.random.default_rng(0)
-    noise = [rng.standard_normal(run.current_a.shape) * np.array([0.0, 0.0, 1.0]) for run in clean]
-    noisy = [
-        replace(run, current_a=run.current_a + one) for run, one in zip(clean, noise, strict=True)
-    ]
-    (found,) = diagnosed(small_truth, noisy[:2], fixed=True)
-    expected = ("axis-error", (), ("J3",))
-    assert (found.name, found.runs, found.axes) == expected
+    noisy = [_with_noise_on_j3(run, rng) for run in clean[:2]]
+    (found,) = diagnosed(small_truth, noisy, fixed=True)
+    assert found.name == "axis-error"
+    assert found.runs == ()
+    assert found.axes == ("J3",)
+
+
+def _with_noise_on_j3(run: Run, rng: np.random.Generator) -> Run:
+    noise_a = rng.standard_normal(run.current_a.shape) * np.array([0.0, 0.0, 1.0])
+    return replace(run, current_a=run.current_a + noise_a)
 
 
 def test_an_error_of_a_held_out_run_is_that_runs_alone(
     small_truth: Truth, clean: list[Run]
 ) -> None:
     """The rows of a search for effects name all runs, those of the fit first."""
-    rng = np.random.default_rng(0)
-    noise = rng.standard_normal(clean[2].current_a.shape) * np.array([0.0, 0.0, 1.0])
-    current_a = clean[2].current_a + noise
-    noisy = replace(clean[2], current_a=current_a)
+    noisy = _with_noise_on_j3(clean[2], np.random.default_rng(0))
     gains = small_truth.gains
     found = identify(
         small_truth.model, clean[:2], SMALL, holdout=[noisy], fixed_gains=gains, keep_rows=True
     )
     for identified in (found, gather(found).identification):
         (one,) = diagnose(identified, AXES, gains)
-        expected = ("axis-error", ("r2",), ("J3",))
-        assert (one.name, one.runs, one.axes) == expected
+        assert one.name == "axis-error"
+        assert one.runs == ("r2",)
+        assert one.axes == ("J3",)
 
 
 def test_a_tiny_torque_is_no_error(small_truth: Truth) -> None:
@@ -288,24 +318,23 @@ def test_a_tiny_torque_is_no_error(small_truth: Truth) -> None:
     left = np.array([1.0, 1.0, 0.09])
     idle = idle_joints(small_truth.model, size, left)
     (found,) = axis_error_diagnoses(size, left, idle, AXES, ())
-    assert (found.name, found.axes) == ("axis-idle", ("J3",))
+    assert found.name == "axis-idle"
+    assert found.axes == ("J3",)
     runs = small_recordings(small_truth, 5, count=1)
-    estimate = identify(
-        small_truth.model,
-        runs,
-        SMALL,
-        fixed_gains=small_truth.gains,
-    ).estimate
-    axes = (3.3, 5.0, 900.0)
-    error = RelativeError(axes, 4.0)
+    gains = small_truth.gains
+    estimate = identify(small_truth.model, runs, SMALL, fixed_gains=gains).estimate
+    error_percent = (3.3, 5.0, 900.0)
+    error = RelativeError(error_percent, 4.0)
     require_plausible(estimate, error, AXES, idle)
     with pytest.raises(ModelContradicted, match="900 % on axis J3"):
         require_plausible(estimate, error, AXES)
 
 
 def test_axes_that_never_move_apart_leave_no_parameters(small_truth: Truth) -> None:
-    def tied(q: FloatArray) -> FloatArray:
-        return np.column_stack((q[:, 0], q[:, 1], 0.5 * q[:, 1] + 1e-6 * q[:, 2]))
+    def tied(position_rad: FloatArray) -> FloatArray:
+        bent_rad = position_rad.copy()
+        bent_rad[:, 2] = 0.5 * position_rad[:, 1] + 1e-6 * position_rad[:, 2]
+        return bent_rad
 
     rng = np.random.default_rng(0)
     run = record(
@@ -326,27 +355,32 @@ def test_the_unit_of_an_effect_is_no_bad_condition(small_truth: Truth) -> None:
     masses.
     """
     runs = small_recordings(small_truth, 0, count=2)
-    found = identify(small_truth.model, runs, SMALL, fixed_gains=small_truth.gains, keep_rows=True)
+    gains = small_truth.gains
+    found = identify(small_truth.model, runs, SMALL, fixed_gains=gains, keep_rows=True)
     assert found.gathered is not None
     _, rows = found.gathered
-    effect = np.zeros((3, 1, rows.current.shape[1]))
+    samples = rows.current.shape[1]
+    effect = np.zeros((3, 1, samples))
     rng = np.random.default_rng(0)
-    effect[1, 0] = rng.standard_normal(rows.current.shape[1])
-    conditions = [
-        wls(
-            rows.extended((Column("effect", "1"),), unit * effect).system(), small_truth.gains
-        ).condition
-        for unit in (1.0, 1e6)
-    ]
-    assert conditions == pytest.approx([found.estimate.condition] * 2, rel=0.1)
-    assert conditions[1] == pytest.approx(conditions[0], rel=1e-6)
+    effect[1, 0] = rng.standard_normal(samples)
+    columns = (Column("effect", "1"),)
+    conditions = []
+    for unit in (1.0, 1e6):
+        system = rows.extended(columns, unit * effect).system()
+        conditions.append(wls(system, gains).condition)
+    small_unit, large_unit = conditions
+    assert small_unit == pytest.approx(found.estimate.condition, rel=0.1)
+    assert large_unit == pytest.approx(found.estimate.condition, rel=0.1)
+    assert large_unit == pytest.approx(small_unit, rel=1e-6)
 
 
 def test_another_estimator_far_from_ml(small_truth: Truth, clean: list[Run]) -> None:
     """IDIM-WLS takes the noise in the currents for smaller gains."""
     found = diagnosed(small_truth, clean, method=Method.WLS)
-    assert {one.name for one in found} == {"estimators-disagree"}
-    assert "J3" in {one.axes[0] for one in found}
+    names = {one.name for one in found}
+    axes = {one.axes[0] for one in found}
+    assert names == {"estimators-disagree"}
+    assert "J3" in axes
     assert "by wls" in found[0].found
     assert "noise in the currents" in found[0].remedy
 
@@ -355,14 +389,18 @@ def test_the_instruments_need_not_agree_with_ml(small_truth: Truth, clean: list[
     """Where a disturbance moves the arm, ml is the one that is off."""
     found = identify(small_truth.model, clean, SMALL)
     gains = 1.3 * found.estimate.gains
-    changed_estimate = replace(found.estimate, method=Method.IV, gains=gains)
-    off = replace(found, estimate=changed_estimate)
-    assert "estimators-disagree" not in {one.name for one in diagnose(off, AXES)}
-    estimate = replace(off.estimate, method=Method.TLS)
-    other = replace(off, estimate=estimate)
-    apart = [one for one in diagnose(other, AXES) if one.name == "estimators-disagree"]
+    by_iv = replace(found.estimate, method=Method.IV, gains=gains)
+    diagnoses_of_iv = diagnose(replace(found, estimate=by_iv), AXES)
+    assert not _named("estimators-disagree", diagnoses_of_iv)
+    by_tls = replace(by_iv, method=Method.TLS)
+    diagnoses_of_tls = diagnose(replace(found, estimate=by_tls), AXES)
+    apart = _named("estimators-disagree", diagnoses_of_tls)
     assert apart
     assert "an effect that the model lacks" in apart[0].remedy
+
+
+def _named(name: str, diagnoses: Iterable[Diagnosis]) -> list[Diagnosis]:
+    return [diagnosis for diagnosis in diagnoses if diagnosis.name == name]
 
 
 def limits_in(text: str) -> tuple[float, float]:
@@ -379,16 +417,18 @@ def limits_in(text: str) -> tuple[float, float]:
 def test_the_scale_of_a_current_beside_a_calibration(scale: float, sign: float) -> None:
     rng = np.random.default_rng(0)
     predicted = rng.standard_normal((2, 200))
-    measured = predicted * np.array([[1.0], [sign * scale]])
+    measured = predicted.copy()
+    measured[1] *= sign * scale
     use = np.ones((2, 200), dtype=bool)
-    found = {one.name: one for one in scale_diagnoses(measured, predicted, use, "ab", ("r",))}
-    assert ("current-reversed" in found) == (sign < 0.0)
-    expected = not 0.7 <= scale <= 1.3
-    assert ("current-off-scale" in found) == expected
-    if "current-off-scale" in found:
-        text = found["current-off-scale"].expected
-        assert limits_in(text) == (0.7, 1.3)
-        assert found["current-off-scale"].axes == ("b",)
+    found = list(scale_diagnoses(measured, predicted, use, "ab", ("r",)))
+    is_reversed = bool(_named("current-reversed", found))
+    assert is_reversed == (sign < 0.0)
+    off_scale = _named("current-off-scale", found)
+    is_off_scale = not 0.7 <= scale <= 1.3
+    assert bool(off_scale) == is_off_scale
+    for one in off_scale:
+        assert limits_in(one.expected) == (0.7, 1.3)
+        assert one.axes == ("b",)
 
 
 def test_noise_makes_no_scale(small_truth: Truth) -> None:
@@ -397,10 +437,13 @@ def test_noise_makes_no_scale(small_truth: Truth) -> None:
     """
     rng = np.random.default_rng(0)
     predicted = rng.standard_normal((1, 400))
+    use = np.ones((1, 400), dtype=bool)
     for seed in range(1, 21):
-        measured = 1.3 * predicted + 0.15 * np.random.default_rng(seed).standard_normal((1, 400))
-        use = np.ones((1, 400), dtype=bool)
-        assert not list(scale_diagnoses(measured, predicted, use, "a", ("r",)))
+        rng = np.random.default_rng(seed)
+        noise = 0.15 * rng.standard_normal((1, 400))
+        measured = 1.3 * predicted + noise
+        found = scale_diagnoses(measured, predicted, use, "a", ("r",))
+        assert not list(found)
 
 
 @given(
@@ -413,12 +456,11 @@ def test_a_gain_is_named_where_the_text_says(ratio: float, std: float, sign: flo
     nameplate = np.array([sign * 20.0])
     gains = ratio * nameplate
     estimate = an_estimate(gains, std * np.abs(nameplate))
-    found = [
-        one
-        for one in gain_diagnoses(estimate, nameplate, ("J1",))
-        if one.name == "gain-off-nameplate"
-    ]
-    is_off = ratio + 3.0 * std < 0.7 or ratio - 3.0 * std > 1.3
+    diagnoses = gain_diagnoses(estimate, nameplate, ("J1",))
+    found = _named("gain-off-nameplate", diagnoses)
+    is_below = ratio + 3.0 * std < 0.7
+    is_above = ratio - 3.0 * std > 1.3
+    is_off = is_below or is_above
     assert bool(found) == is_off
     for one in found:
         assert limits_in(one.expected) == (0.7, 1.3)
@@ -443,21 +485,24 @@ def test_a_gain_that_the_moves_hardly_show_is_named_where_its_number_is_absurd(
     gains = np.array([gain])
     estimate = an_estimate(gains, np.array([std]))
     nameplate = np.array([38.0])
-    found = [one for one in gain_diagnoses(estimate, nameplate, ("J1",)) if one.name == GAIN_UNSEEN]
+    diagnoses = gain_diagnoses(estimate, nameplate, ("J1",))
+    found = _named(GAIN_UNSEEN, diagnoses)
     assert bool(found) == is_named
     for one in found:
         assert one.axes == ("J1",)
         assert "record" in one.remedy
 
 
-def test_the_papers_gains_are_not_off_their_nameplates() -> None:
+@pytest.mark.parametrize(
+    ("gain", "std_percent"), [(-8.06, 3.33), (-8.27, 1.76), (-8.31, 1.99), (-9.21, 2.75)]
+)
+def test_the_papers_gains_are_not_off_their_nameplates(gain: float, std_percent: float) -> None:
     """J4 in Tables 2 and 4: up to 30 % below the nameplate of 11.52, with σ of 2 to 3 %."""
     nameplate = np.array([-11.52])
-    for gain, percent in ((-8.06, 3.33), (-8.27, 1.76), (-8.31, 1.99), (-9.21, 2.75)):
-        std = np.array([percent / 100.0 * abs(gain)])
-        gains = np.array([gain])
-        estimate = an_estimate(gains, std)
-        assert not list(gain_diagnoses(estimate, nameplate, ("J4",)))
+    std = std_percent / 100.0 * abs(gain)
+    estimate = an_estimate(np.array([gain]), np.array([std]))
+    found = gain_diagnoses(estimate, nameplate, ("J4",))
+    assert not list(found)
 
 
 def an_estimate(gains: FloatArray, std: FloatArray) -> Estimate:
@@ -483,17 +528,12 @@ def an_estimate(gains: FloatArray, std: FloatArray) -> Estimate:
 def test_ranges_in_texts_are_those_that_are_tested(small_truth: Truth, clean: list[Run]) -> None:
     """A factor that a refusal names is the one that it tests."""
     gains = np.full(3, 1.01 * UNIT_RATIO)
-    with pytest.raises(
-        UnitsMistaken,
-        match=rf"0\.7 to 1\.3, and within a factor of {UNIT_RATIO:g} "
-        r"on one axis",
-    ):
+    words = rf"0\.7 to 1\.3, and within a factor of {UNIT_RATIO:g} on one axis"
+    with pytest.raises(UnitsMistaken, match=words):
         require_units(gains, np.ones(3))
-    bodies = {1: 0.0 * BODY}
-    forgotten = [clean[0], small_recordings(small_truth, 0, count=2, bodies=bodies)[1]]
-    (found,) = diagnosed(small_truth, forgotten, fixed=True)
-    expected = f"1, and within a factor of {WEIGHT_RATIO:g}"
-    assert found.expected == expected
+    without_payload = _second_run_without_payload(small_truth)
+    (found,) = diagnosed(small_truth, [clean[0], without_payload], fixed=True)
+    assert found.expected == f"1, and within a factor of {WEIGHT_RATIO:g}"
 
 
 @pytest.mark.parametrize("factor", [0.51, 2.0])
@@ -503,7 +543,8 @@ def test_a_current_in_another_ampere_is_named(
     """A torque constant that is applied twice, or an ampere that is a peak value of two."""
     runs = with_currents(clean, np.array([1.0, factor, 1.0]))
     (found,) = diagnosed(small_truth, runs)
-    assert (found.name, found.axes) == ("gain-off-nameplate", ("J2",))
+    assert found.name == "gain-off-nameplate"
+    assert found.axes == ("J2",)
     ratio = re.search(r"([0-9.]+) times the nameplate$", found.found)
     assert ratio is not None
     assert float(ratio[1]) == pytest.approx(1.0 / factor, rel=0.05)
@@ -513,21 +554,21 @@ def test_the_axis_whose_friction_jumps_through_zero_is_found_by_its_equation(
     small_truth: Truth,
 ) -> None:
     """Without noise, and at 200 Hz, the current of J3 is near zero in two samples of 16 s."""
-    runs = small_recordings(small_truth, 3, count=1, noise_a=0.0)
-    assert unsigned_channels(small_truth.model, runs, SMALL, AXES) is None
-    current_a = runs[0].current_a
-    size = np.abs(current_a[:, 2])
-    stacked_current_a = np.column_stack((runs[0].current_a[:, :2], size))
-    sized = [replace(runs[0], current_a=stacked_current_a)]
-    assert not any(
-        unsigned_currents(run, small_truth.model.drive_train.ratio).any() for run in sized
-    )
-    found = unsigned_channels(small_truth.model, sized, SMALL, AXES)
+    model = small_truth.model
+    (run,) = small_recordings(small_truth, 3, count=1, noise_a=0.0)
+    assert unsigned_channels(model, [run], SMALL, AXES) is None
+    size_a = np.abs(run.current_a[:, 2])
+    current_a = run.current_a.copy()
+    current_a[:, 2] = size_a
+    unsigned = replace(run, current_a=current_a)
+    by_shape = unsigned_currents(unsigned, model.drive_train.ratio)
+    assert not by_shape.any()
+    found = unsigned_channels(model, [unsigned], SMALL, AXES)
     assert found is not None
     assert found.axes == ("J3",)
-    offset = np.array([0.0, 0.0, 2.0 * float(size.max())])
-    lifting = [replace(run, current_a=run.current_a + offset) for run in runs]
-    assert unsigned_channels(small_truth.model, lifting, SMALL, AXES) is None
+    offset_a = np.array([0.0, 0.0, 2.0 * float(size_a.max())])
+    lifting = replace(run, current_a=run.current_a + offset_a)
+    assert unsigned_channels(model, [lifting], SMALL, AXES) is None
 
 
 def _pendulum_run() -> Run:
@@ -538,27 +579,34 @@ def _pendulum_run() -> Run:
     turns.
     """
     rate_hz = 500.0
-    ramp = np.clip(np.arange(0.0, 0.6, 1.0 / rate_hz) / 0.6, 0.0, 1.0)
+    lift_s = np.arange(0.0, 0.6, 1.0 / rate_hz)
+    ramp = np.clip(lift_s / 0.6, 0.0, 1.0)
     way = ramp**2 * (3.0 - 2.0 * ramp)
     pause = np.zeros(25)
     lifts = []
     for lift in range(20):
         height_rad = 1.2 if lift % 2 else 0.84
-        lifts += [height_rad * way, height_rad + pause, height_rad * way[::-1], pause]
-    position = np.concatenate(lifts)
-    time_s = np.arange(len(position)) / rate_hz
-    velocity = np.gradient(position, time_s)
-    acceleration = np.gradient(velocity, time_s)
-    current = np.sin(position) + 0.005 * acceleration + 0.02 * np.sign(np.round(velocity, 3))
+        up = height_rad * way
+        at_the_top = height_rad + pause
+        down = height_rad * way[::-1]
+        lifts += [up, at_the_top, down, pause]
+    position_rad = np.concatenate(lifts)
+    time_s = np.arange(len(position_rad)) / rate_hz
+    velocity_rad_s = np.gradient(position_rad, time_s)
+    acceleration_rad_s2 = np.gradient(velocity_rad_s, time_s)
+    direction = np.sign(np.round(velocity_rad_s, 3))
+    current_a = np.sin(position_rad) + 0.005 * acceleration_rad_s2 + 0.02 * direction
     rng = np.random.default_rng(1)
-    current = current + 1e-3 * rng.standard_normal(len(current))
-    return Run("lifts", time_s, position[:, None], current[:, None])
+    noise_a = 1e-3 * rng.standard_normal(len(current_a))
+    noisy_a = current_a + noise_a
+    return Run("lifts", time_s, position_rad[:, None], noisy_a[:, None])
 
 
 def test_a_load_that_is_always_carried_is_explained_by_the_equation_of_its_motor() -> None:
     rotation = np.eye(3)
     translation_m = np.zeros(3)
-    link = Joint("J1", JointKind.REVOLUTE, -1, rotation, translation_m, np.array([0.0, 0.0, 1.0]))
+    z_axis = np.array([0.0, 0.0, 1.0])
+    link = Joint("J1", JointKind.REVOLUTE, -1, rotation, translation_m, z_axis)
     gravity_m_s2 = np.array([0.0, -9.81, 0.0])
     robot = Robot((link,), gravity_m_s2)
     drive_train = DriveTrain(np.eye(1))
@@ -586,5 +634,6 @@ def test_a_recording_is_judged_alike_whatever_the_method(
     """The estimator is named for what it makes of the noise, the recording for its mistake."""
     runs = with_currents(clean, np.array([1.0, 0.51, 1.0]))
     found = diagnosed(small_truth, runs, method=method)
-    by_ml = diagnosed(small_truth, with_currents(clean, np.array([1.0, 0.51, 1.0])))
-    assert tuple(one for one in found if one.name != "estimators-disagree") == by_ml
+    by_ml = diagnosed(small_truth, runs)
+    of_the_recording = [one for one in found if one.name != "estimators-disagree"]
+    assert tuple(of_the_recording) == by_ml
