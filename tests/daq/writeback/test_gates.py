@@ -429,7 +429,9 @@ def _assert_refused(inputs: ProposalInputs, gate: Gate, subject: str, change: Ch
         assert one["gate"] == gate.value
 
 
-def test_a_refusal_names_a_wrong_description_that_the_calibration_corrects(inputs: ProposalInputs) -> None:
+def test_a_refusal_names_a_wrong_description_that_the_calibration_corrects(
+    inputs: ProposalInputs,
+) -> None:
     off = diagnosis_named("zero-off", "J3")
     corrected = _corrected("zero-offset", off)
     of_another_cell = _calibration(cell="another")
@@ -942,7 +944,9 @@ def test_an_age_below_a_day_is_reported_in_hours(inputs: ProposalInputs) -> None
 
 
 @pytest.mark.parametrize("days", [3, 730])
-def test_a_log_of_a_wrong_later_date_is_refused_with_the_way_out(inputs: ProposalInputs, days: int) -> None:
+def test_a_log_of_a_wrong_later_date_is_refused_with_the_way_out(
+    inputs: ProposalInputs, days: int
+) -> None:
     recorded_s = (NOW + days * DAY).timestamp()
     future = _source(0, recorded_s=recorded_s)(replace(inputs, policy=ApplyPolicy()))
     (refusal,) = future.propose().refusals
@@ -951,7 +955,9 @@ def test_a_log_of_a_wrong_later_date_is_refused_with_the_way_out(inputs: Proposa
     assert "it keeps that date: record again and fit" in refusal.remedy
 
 
-def test_a_mass_corrected_since_the_fit_is_seen_through_configuration_changed(inputs: ProposalInputs) -> None:
+def test_a_mass_corrected_since_the_fit_is_seen_through_configuration_changed(
+    inputs: ProposalInputs,
+) -> None:
     cell = _payload(mass_kg=5.0)(inputs).cell
     request = Request(
         inputs.calibration, NOW, policy=ApplyPolicy(), accepts_changed_configuration=True
@@ -1037,7 +1043,9 @@ def test_an_effect_on_all_axes_is_called_so(inputs: ProposalInputs) -> None:
     assert refusal.subject == "effect time-skew on all axes"
 
 
-def test_a_library_that_reports_no_gate_context_is_not_asked_for_them(inputs: ProposalInputs) -> None:
+def test_a_library_that_reports_no_gate_context_is_not_asked_for_them(
+    inputs: ProposalInputs,
+) -> None:
     source = Source("old", "a" * 64, "fit")
     sources = (source,)
     old = replace(inputs.calibration, sources=sources)
