@@ -98,8 +98,10 @@ def _is_marked(place: Path) -> bool:
     """Whether a file or folder is immutable or append-only; not where that cannot be asked."""
     try:
         descriptor = os.open(place, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
-    except OSError:
-        return False
+    except OSError as error:
+        if error.errno in (errno.ENOENT, errno.EACCES, errno.EPERM, errno.ENXIO):
+            return False
+        raise  # a disk that fails now would fail the write
     answer = bytearray(struct.calcsize("l"))
     try:
         fcntl.ioctl(descriptor, _FS_IOC_GETFLAGS, answer)
