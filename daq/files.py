@@ -20,6 +20,11 @@ from pathlib import Path
 
 from daq.errors import FileImmutable, OwnerNotKept, WriteUnconfirmed
 
+# ioctl_iflags(2): command and bits
+_FS_IOC_GETFLAGS = 0x80086601
+_FS_APPEND_FL = 0x20
+_FS_IMMUTABLE_FL = 0x10
+
 
 def replace_file(
     path: Path,
@@ -43,9 +48,9 @@ def replace_file(
         like: file whose mode, owner and access lists are used instead.
 
     Raises:
-        OSError: from the file system, also if owner or access lists cannot be kept, or a mark
-            forbids it (`FileImmutable`); as `judge_target`; or a folder is at `path`. The old
-            content is in place.
+        OSError: from the file system, also if owner or access lists cannot be kept, or file or
+            folder is immutable (`FileImmutable`); as `judge_target`; or a folder is at `path`. The
+            old content is in place.
         WriteUnconfirmed: the fsync of the folder failed; the new content is in place.
     """
     target = judge_target(path)
@@ -75,19 +80,19 @@ def replace_file(
         raise WriteUnconfirmed.of(path, error) from error
 
 
-#: ioctl_iflags(2): command and bits
-_FS_IOC_GETFLAGS = 0x80086601
-_FS_APPEND_FL = 0x20
-_FS_IMMUTABLE_FL = 0x10
-
-
 def _require_unmarked(path: Path, target: Path) -> None:
-    """Refuse a file that cannot be replaced because of a mark of it or of its folder (chattr).
+    """Refuse to replace a file where it or its folder is marked as immutable or append-only.
 
-    Before a temporary file is made: one in a folder that may only grow could not be removed.
+    This comes before a temporary file is made, which could not be removed from a folder that is
+    append-only.
+
+    Args:
+        path: the file as it was named.
+        target: where it is.
 
     Raises:
         FileImmutable: one of the two has such a mark.
+        OSError: one of the two cannot be opened, for another reason than missing rights.
     """
     for place in (target, target.parent):
         if _is_marked(place):
@@ -98,10 +103,8 @@ def _is_marked(place: Path) -> bool:
     """Whether a file or folder is immutable or append-only; not where that cannot be asked."""
     try:
         descriptor = os.open(place, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
-    except OSError as error:
-        if error.errno in (errno.ENOENT, errno.EACCES, errno.EPERM, errno.ENXIO):
-            return False
-        raise  # a disk that fails now would fail the write
+    except (FileNotFoundError, PermissionError):
+        return False
     answer = bytearray(struct.calcsize("l"))
     try:
         fcntl.ioctl(descriptor, _FS_IOC_GETFLAGS, answer)

@@ -95,8 +95,8 @@ class CurrentScale:
     """Conversion of a raw current to ampere.
 
     Ampere per raw unit = factor × product of the values of `objects` × weight of the value of
-    `switch`. CiA 402 without a vendor's objects: factor 1e-6
-    (per mille of mA) × motor rated current 6075h.
+    `switch`. With the objects of CiA 402 alone, the factor is 1e-6 (per mille of mA), and the
+    object is the motor rated current 6075h.
     """
 
     factor: float

@@ -7,8 +7,9 @@ loopback interface alone. A client that does not read is disconnected when ``BAC
 for it, so that no frame is lost silently: its next call fails.
 
 The first client of a channel is the simulated cell, and is never disconnected. While more than
-``THROTTLE_BYTES`` wait for it, the server reads no other client: as on a wire, nobody sends faster
-than the cell receives. Nor does it read a client that leaves the server's own answers unread.
+``THROTTLE_BYTES`` wait for it, the server reads no other client, so that nobody sends faster
+than the cell receives, as on a real bus. Nor does it read a client that leaves the server's own
+answers unread.
 """
 
 from __future__ import annotations

@@ -47,7 +47,7 @@ def family(effect: Callable[..., Effect], **values: Sequence[float]) -> Family:
 
 
 MOTOR_ORDERS = (1, 2, 3, 4, 5, 6, 8, 10, 12)
-"""Of cogging, per motor revolution."""
+"""Orders of cogging: periods per motor revolution."""
 SECOND_JOINTS = range(2, 13)
 """Number of an effect's second joint; the search leaves out pairs that a robot lacks."""
 

@@ -49,8 +49,8 @@ class Punctuality:
 
     def __str__(self) -> str:
         return (
-            f"{self.late} of {self.cycles} cycles of {1e3 * PERIOD_S:.0f} ms late, "
-            f"the latest by {1e3 * self.longest_s:.0f} ms"
+            f"{self.late} of {self.cycles} cycles of {1e3 * PERIOD_S:.0f} ms were late; "
+            f"the slowest took {1e3 * self.longest_s:.0f} ms"
         )
 
 

@@ -45,7 +45,7 @@ CURRENT_NAMES = [f"i{axis}" for axis in range(1, 7)]
 VELOCITY_NAMES = [f"v{axis}" for axis in range(1, 7)]
 NAMES = [*POSITION_NAMES, *CURRENT_NAMES]
 COUNTS_PER_REVOLUTION = 65536
-"""Of every encoder of the demo cell."""
+"""Counts per revolution of every encoder of the demo cell."""
 
 
 def phases_rad(time: FloatArray) -> FloatArray:

@@ -24,7 +24,7 @@ NOW = datetime(2025, 1, 2, 3, 4, 5, tzinfo=UTC)
 
 
 def _refused_request() -> Request:
-    """Of gains that no cell's policy takes."""
+    """Return a request to write gains that no cell's policy accepts."""
     calibration = demo_calibration()
     gains = tuple(replace(gain, value=100.0 * gain.value) for gain in calibration.gains)
     return Request(replace(calibration, gains=gains), NOW)

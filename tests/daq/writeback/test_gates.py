@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -120,11 +121,11 @@ def inputs(tmp_path: Path) -> ProposalInputs:
 Change = Callable[[ProposalInputs], ProposalInputs]
 
 
-def _gain(axis: str, **changes: float) -> Change:
+def _gain(axis: str, **changes: Any) -> Change:
     def broken(inputs: ProposalInputs) -> ProposalInputs:
         gains = list(inputs.calibration.gains)
         index = AXES.index(axis)
-        gains[index] = replace(gains[index], **changes)  # type: ignore[arg-type]  # fields by name
+        gains[index] = replace(gains[index], **changes)
         return _calibration(gains=tuple(gains))(inputs)
 
     return broken
@@ -154,21 +155,21 @@ def _nameplate(axis: str, nameplate: float) -> Change:
     return broken
 
 
-def _payload(**changes: object) -> Change:
+def _payload(**changes: Any) -> Change:
     """Another disc in the cell file now, which has been reviewed: every digest is right."""
 
     def broken(inputs: ProposalInputs) -> ProposalInputs:
         (disc,) = inputs.cell.payloads
-        other_disc = replace(disc, **changes)  # type: ignore[arg-type]
+        other_disc = replace(disc, **changes)
         cell = replace(inputs.cell, payloads=(other_disc,))
         return replace(inputs, cell=cell)
 
     return broken
 
 
-def _calibration(**changes: object) -> Change:
+def _calibration(**changes: Any) -> Change:
     def broken(inputs: ProposalInputs) -> ProposalInputs:
-        calibration = replace(inputs.calibration, **changes)  # type: ignore[arg-type]
+        calibration = replace(inputs.calibration, **changes)
         return replace(inputs, calibration=calibration)
 
     return broken
@@ -186,7 +187,7 @@ def _nameplate_holdout_error(axes: tuple[float, ...], overall: float) -> Change:
     return _calibration(nameplate_holdout_error_percent=RelativeError(axes, overall))
 
 
-def _logs(**changes: object) -> Change:
+def _logs(**changes: Any) -> Change:
     def broken(inputs: ProposalInputs) -> ProposalInputs:
         calibration = with_recordings(inputs.calibration, **changes)
         return replace(inputs, calibration=calibration)
@@ -194,22 +195,22 @@ def _logs(**changes: object) -> Change:
     return broken
 
 
-def _source(index: int, **changes: object) -> Change:
+def _source(index: int, **changes: Any) -> Change:
     """A change of one log, or of how it was recorded."""
 
     def broken(inputs: ProposalInputs) -> ProposalInputs:
         sources = list(inputs.calibration.sources)
         recording = sources[index].recording
-        of_recording = {}
-        of_source = {}
+        of_recording: dict[str, Any] = {}
+        of_source: dict[str, Any] = {}
         for key, value in changes.items():
             if key in _RECORDING:
                 of_recording[key] = value
             else:
                 of_source[key] = value
         if recording is not None and of_recording:
-            of_source["recording"] = replace(recording, **of_recording)  # type: ignore[arg-type]
-        sources[index] = replace(sources[index], **of_source)  # type: ignore[arg-type]
+            of_source["recording"] = replace(recording, **of_recording)
+        sources[index] = replace(sources[index], **of_source)
         return _calibration(sources=tuple(sources))(inputs)
 
     return broken
@@ -289,8 +290,8 @@ def _only(*indices: int) -> Change:
     return broken
 
 
-def _inputs(**changes: object) -> Change:
-    return lambda inputs: replace(inputs, **changes)  # type: ignore[arg-type]
+def _inputs(**changes: Any) -> Change:
+    return lambda inputs: replace(inputs, **changes)
 
 
 def _effect(inputs: ProposalInputs) -> ProposalInputs:
