@@ -326,7 +326,7 @@ def _hinge(t: TrueSignals) -> FloatArray:
 
 
 def _hose(t: TrueSignals) -> FloatArray:
-    """A hose of 30 Nm/rad whose way is 0.8 q_i − 0.6 q_j, which inertia_columns and pushes."""
+    """A hose of 30 Nm/rad whose way is 0.8 q_i − 0.6 q_j, which pulls and pushes."""
     way = 0.8 * t.position - 0.6 * t.positions[J3]
     force = 30.0 * way
     torque = np.zeros_like(t.positions)
@@ -336,7 +336,7 @@ def _hose(t: TrueSignals) -> FloatArray:
 
 
 def _slack_cable(t: TrueSignals) -> FloatArray:
-    """A cable that inertia_columns where the joint is before J3, around both at one radius;
+    """A cable that pulls where the joint is before J3, around both at one radius;
     half of it on each.
     """
     position_difference = t.position - t.positions[J3]
