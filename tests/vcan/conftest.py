@@ -7,29 +7,33 @@ what it heard.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
 
+from tests.vcan.host_stalls import stalls_between
+from tests.vcan.host_watch import watched, watching
 from tests.vcan.judgement import SAME_SYNC_NS, compare
 from tests.vcan.listener import heard, listening
 from tests.vcan.log_reader import read_recorded
-from tests.vcan.punctuality import measure_punctuality
 from tests.vcan.run import INTERFACE
 
 SECOND_BUS_NS = 10_000_000
 """SYNC is sent on one bus after the other, by a process that may have to wait between;
 cycles last 40 ms there.
 """
-WITHOUT_CAN = ("test_run.py", "test_judgement.py", "test_punctuality.py")
+WITHOUT_CAN = ("test_run.py", "test_judgement.py", "test_host_stalls.py")
 ATTEMPTS = 8
 """A guest on a busy host stands still for a moment: SYNC is late, or the amplifiers miss the
 recorder, and the run is ended or marked invalid as at a real cell. One records again.
 """
 FIGURES = pytest.StashKey[list[str]]()
-EXCUSED = pytest.StashKey[bool]()
+EXCUSED = pytest.StashKey[dict[BaseException, str]]()
+"""Reason by the error that is excused: a fixture of a module raises the same one for each test."""
+HOST_WATCH = pytest.StashKey[Path]()
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -38,7 +42,7 @@ def pytest_configure(config: pytest.Config) -> None:
         "markers", f"vcan: needs the kernel's CAN as {INTERFACE} (make test-vcan)"
     )
     config.stash[FIGURES] = []
-    config.stash[EXCUSED] = False
+    config.stash[EXCUSED] = {}
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -60,21 +64,26 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def pytest_runtest_makereport(
     item: pytest.Item, call: pytest.CallInfo[None]
 ) -> Generator[None, pytest.TestReport, pytest.TestReport]:
-    """Skip a test that failed on a machine that does not keep the times of a cell at all.
+    """Skip a test that failed while the machine stood still again and again.
 
     What the logs hold is compared in the teardown of a module; that is never excused.
     """
     report = yield
-    on_the_bus = item.get_closest_marker("vcan") is not None
-    if not on_the_bus or not report.failed or call.when == "teardown":
+    host_watch = item.config.stash.get(HOST_WATCH, None)
+    if host_watch is None or call.excinfo is None:
         return report
-    measured = measure_punctuality()
-    if measured.is_enough:
+    if not report.failed or call.when == "teardown":
         return report
+    error = call.excinfo.value
+    excused = item.config.stash[EXCUSED]
+    if error not in excused:
+        stalls = stalls_between(watched(host_watch), call.start, call.stop)
+        if not stalls.excuse_a_failure:
+            return report
+        excused[error] = f"it failed, and {stalls}"
     path, line, _ = item.location
-    reason = f"it failed, and this machine is too slow for it now: {measured}"
+    reason = excused[error]
     item.config.stash[FIGURES].append(f"{item.nodeid}: {reason}; {report.longreprtext[-300:]}")
-    item.config.stash[EXCUSED] = True
     report.outcome = "skipped"
     report.longrepr = (path, (line or 0) + 1, reason)
     return report
@@ -96,9 +105,28 @@ def figure(pytestconfig: pytest.Config) -> Iterator[Callable[[str], None]]:
     yield pytestconfig.stash[FIGURES].append
 
 
+@pytest.fixture(scope="session", autouse=True)
+def host_watch(
+    pytestconfig: pytest.Config,
+    tmp_path_factory: pytest.TempPathFactory,
+    figure: Callable[[str], None],
+) -> Iterator[None]:
+    """Notes when the machine stands still, while there is a bus."""
+    if not (Path("/sys/class/net") / INTERFACE).exists():
+        yield
+        return
+    path = tmp_path_factory.mktemp("host") / "watch"
+    begun_s = time.time()
+    with watching(path):
+        pytestconfig.stash[HOST_WATCH] = path
+        yield
+        del pytestconfig.stash[HOST_WATCH]
+    figure(str(stalls_between(watched(path), begun_s, time.time())))
+
+
 @pytest.fixture(scope="module")
 def attempts(pytestconfig: pytest.Config) -> range:
-    """Numbers of the attempts at a recording; one alone where the machine has been too slow."""
+    """Numbers of the attempts at a recording; one alone once a test was excused."""
     if pytestconfig.stash[EXCUSED]:
         return range(1, 2)
     return range(1, ATTEMPTS + 1)

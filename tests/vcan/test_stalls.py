@@ -229,7 +229,8 @@ def test_a_short_stop_loses_nothing(
     tmp_path: Path, attempts: range, whole: bool, figure: Callable[[str], None]
 ) -> None:
     name = "recorder" if whole else "capture process"
-    for attempt in attempts:  # on a busy host the simulated amplifiers may be late
+    statistics = None
+    for attempt in attempts:
         folder = tmp_path / str(attempt)
         folder.mkdir()
         with recording(folder) as run:
@@ -242,18 +243,21 @@ def test_a_short_stop_loses_nothing(
                     os.kill(pid, signal.SIGCONT)
                 time.sleep(1.0)
             said, _ = run.end()
-        # A busy host may starve the amplifiers: supervision ends such a run.
-        ended = (ExitCode.OK, ExitCode.DATA_UNFIT, ExitCode.DEVICE_FAULT)
-        assert run.process.returncode in ended, said
+        if run.process.returncode == ExitCode.DEVICE_FAULT:
+            # A busy host may starve the amplifiers: supervision ends such a run.
+            continue
+        assert run.process.returncode in (ExitCode.OK, ExitCode.DATA_UNFIT), said
         found = read_log(folder / "run.mcap")
-        if found.statistics.valid:
+        statistics = found.statistics
+        if statistics.valid:
             break
-    lost = found.statistics.reason or "nothing lost"
+    assert statistics is not None, said
+    lost = statistics.reason or "nothing lost"
     figure(
         f"{name} stopped for 30, 100, 300 ms: {len(found.samples.cycle)} samples, {lost}, "
         f"attempt {attempt}"
     )
-    assert found.statistics.valid
+    assert statistics.valid
 
 
 @contextmanager
