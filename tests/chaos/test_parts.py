@@ -109,6 +109,8 @@ def test_a_reader_that_goes_away_breaks_a_pipe_and_hangs_up_a_terminal(
     tmp_path: Path, terminal: bool, code: int
 ) -> None:
     def print_on() -> int:
+        # Under nohup every process ignores a hang-up.
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)
         try:
             while True:
                 os.write(1, b"words")
