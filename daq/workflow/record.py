@@ -76,6 +76,7 @@ LATE_LOSSES_S = 0.25
 """Time to read on after the last sample:
 the interface's counters are read five times a second (capture.py).
 """
+LATEST_ANSWERS_S = 0.1  #: Time in which a cell has answered the last SYNC, even if it is late
 SPACE_CHECK_S = 0.1  #: Recorded time between two checks of the free space on the disk
 SLOW_DISK_S = 1.0  #: Longest time for which a part of the log may wait for the disk unremarked
 ROUNDING = 1.001  #: Factor by which rounding to whole counts may exceed a limit
@@ -229,6 +230,7 @@ def record(
         permission = MotionPermission(granted_by, motor_limits(cell, scale))
         pacing = partial(_pacing, cell, clocks.wall_ns(), clocks, producer)
         start_counts, recovered = _start(cell, network, scale, permission, pacing, require_released)
+        _let_rest(producer, network)
         moves, around = _checked_moves(cell, request.plan, scale, start_counts, permission)
         room = DiskRoom(out, free)
         room.require(_log_bytes(cell, moves, start_counts, files))
@@ -768,6 +770,17 @@ def _started(
             f"SYNC is sent by this program, and late when the computer is busy: {error.reason}",
         )
     return producer, ()
+
+
+def _let_rest(producer: SyncProducer | None, network: CanopenNetwork) -> None:
+    """Stop SYNC until the recording's stream, and wait for the last answers.
+
+    The stream starts SYNC again, at any time after the last one. Answers to that one must not come
+    then: they would be taken for answers to the stream's first.
+    """
+    if producer is not None:
+        producer.rest()
+        network.link.wait(LATEST_ANSWERS_S)
 
 
 def _pacing(cell: Cell, start_ns: int, clocks: Clocks, producer: SyncProducer | None) -> Pacing:

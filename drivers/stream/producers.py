@@ -147,6 +147,9 @@ class KernelProducer(Producer, AbstractContextManager["KernelProducer"]):
             self._interval_us = interval_us
             self._socket.send(setup_message(_SET_TIMER, interval_us))
 
+    def rest(self) -> None:
+        self.pause()
+
     def pause(self) -> None:
         """Stop sending; SYNCs on their way are still the kernel's."""
         if self._socket is not None:

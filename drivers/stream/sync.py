@@ -38,6 +38,10 @@ FRAMES_PER_S = 50_000
 """Frames per second of time-out to read past the deadline before a producer is dead;
 two full buses carry fewer.
 """
+STAMP_ERROR_NS = 1_000_000
+"""Largest error of a stamp; the kernel's are converted to another clock, to some tens of
+microseconds.
+"""
 #: SYNCs ahead of the schedule that are too many; a late producer catches up with one or two
 SURPLUS = 3.0
 DECAY = 0.99
@@ -104,6 +108,9 @@ class Producer:
         """Process a SYNC by its time [ns], and its periods since the one before,
         0 for the first.
         """
+
+    def rest(self) -> None:
+        """Stop sending until the next start, if that begins a new phase of SYNC."""
 
     def pause(self) -> None:
         """Stop sending, without waiting for an answer."""
@@ -235,6 +242,20 @@ class TimedCycles(_CyclesByClock):
 class _CyclesByOrder(Cycles):
     """Cycles that end with the next SYNC, in the order of the frames on the bus."""
 
+    def __init__(self, bus: CycleBus) -> None:
+        super().__init__(bus)
+        self._begun_ns = 0  # by the clock; an earlier SYNC begins no cycle
+
+    def _is_from_before(self, message: can.Message) -> bool:
+        """Return whether a frame is older than the stream.
+
+        A capture process that had to wait for a processor still hands over such frames after
+        `begin` has read all that were there.
+        """
+        if self.bus.cycles or not isinstance(message, CapturedMessage):
+            return False
+        return message.monotonic_ns < self._begun_ns
+
     @abstractmethod
     def _read(self) -> can.Message | None:
         """Return the next frame; None if none comes in time."""
@@ -247,7 +268,7 @@ class _CyclesByOrder(Cycles):
             message = self._read()
             if message is None:
                 return None
-            if self.is_next_sync(message):
+            if self.is_next_sync(message) and not self._is_from_before(message):
                 sync = message
             else:
                 self.bus.process_between(message)
@@ -280,6 +301,11 @@ class EchoedCycles(_CyclesByOrder):
         # left out before it.
         self._sent: deque[tuple[int, int]] = deque()
         self._comes_back = True
+
+    def begin(self) -> Cycles:
+        # Our first SYNC follows at once, and must not seem older because of its stamp's error.
+        self._begun_ns = self.bus.clock() - STAMP_ERROR_NS
+        return super().begin()
 
     def open(self) -> Cycles | None:
         bus = self.bus
@@ -339,12 +365,12 @@ class FollowedCycles(_CyclesByOrder):
 
     def begin(self) -> Cycles:
         bus = self.bus
-        begun_ns = bus.clock()
+        self._begun_ns = bus.clock()
         for message in bus.arrived_frames():
             if (
                 is_sync(message)
                 and isinstance(message, CapturedMessage)
-                and message.monotonic_ns > begun_ns
+                and message.monotonic_ns > self._begun_ns
             ):
                 # If frames arrive as fast as they are read, the loop would not end
                 self.early_sync = message

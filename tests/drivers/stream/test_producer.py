@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 import struct
 
 import pytest
@@ -74,6 +75,29 @@ def test_a_drive_pauses_without_being_waited_for_and_starts_again() -> None:
             assert node.value(0x1005, 0) == 0x80 | PRODUCES
         assert node.value(0x1005, 0) == 0x80
         assert node.value(0x1006, 0) == 500
+
+
+def test_a_drive_that_rests_goes_on_in_its_phase() -> None:
+    network, bus = cell()
+    node = with_sync_objects(bus.nodes[1], 0x80, 500)
+    with network, DriveProducer(network, 1, PERIOD_US) as producer:
+        producer.start()
+        bus.sent.clear()
+        producer.rest()
+        assert bus.sent == []
+        assert node.value(0x1005, 0) == 0x80 | PRODUCES
+
+
+def test_the_kernel_that_rests_sends_no_sync_and_stays_the_producer() -> None:
+    network, _ = cell()
+    near, far = socket.socketpair()
+    with network, far, KernelProducer(network, PERIOD_US) as producer:
+        producer._socket = near
+        network.link.sync_producer = producer.name
+        producer.rest()
+        # The broadcast manager ends with its socket.
+        assert near.fileno() == -1
+        assert network.link.sync_producer == "the kernel"  # a SYNC on its way is no foreign one
 
 
 def test_a_drive_that_cannot_produce_says_so_and_is_given_back() -> None:

@@ -353,3 +353,49 @@ def test_our_heartbeat_goes_on_while_sync_comes_back() -> None:
     timeline.shutdown()
     assert passed_ms > 10.0
     assert timeline.beats == pytest.approx(passed_ms / 3.0, abs=1.0)
+
+
+class TimelineWithOlderFrames(Timeline):
+    """A timeline whose capture process hands over a SYNC and its answers a moment too late:
+    they are older than the stream, and come after it has begun.
+    """
+
+    OLD_NS = 12 * PERIOD_NS
+    LAG_NS = 100_000
+    OLD_ANSWER = bytes((99, 0, 0, 0)) + b"\0\0\x50\x02"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.opened_ns = self.clock.now_ns
+        at_ns = self.opened_ns - self.OLD_NS
+        self._put(at_ns, 0x80, b"", is_rx=self.producer)
+        for node in self.nodes:
+            self._put(at_ns + 1, 0x180 + node, self.OLD_ANSWER)
+
+    def _readable_ns(self, at_ns: int) -> int:
+        if at_ns < self.opened_ns:
+            return self.opened_ns + self.LAG_NS
+        return super()._readable_ns(at_ns)
+
+
+@pytest.mark.parametrize("producer", [True, False], ids=["producer", "own"])
+def test_a_sync_from_before_the_stream_that_is_handed_over_late_begins_no_cycle(
+    producer: bool,
+) -> None:
+    network, scripted = cell()
+    clock = scripted.clock
+    timeline = TimelineWithOlderFrames(clock, [[300_000] * CYCLES] * 2, producer=producer)
+    network.link._bus = timeline
+    network.link.sync_producer = "J1" if producer else None
+    pacing: FollowedSync | TimedSync = TimedSync(PERIOD_NS, 0, clock)
+    if producer:
+        pacing = FollowedSync(PERIOD_NS, ProducerOnTimeline(timeline), 0.1, clock=clock)
+    stream = SyncStream(network, pacing)
+    samples = [stream.advance() for _ in range(CYCLES)]
+    timeline.shutdown()
+    positions = [sample.position_counts for sample in samples]
+    assert positions == [(number, number) for number in range(CYCLES)]
+    times_ns = [sample.time_ns - samples[0].time_ns for sample in samples]
+    assert times_ns == [number * PERIOD_NS for number in range(CYCLES)]
+    foreign = len(timeline.nodes)
+    assert stream.statistics == StreamStatistics(cycles=CYCLES, frames=2 * CYCLES, foreign=foreign)
