@@ -207,18 +207,12 @@ class Fault:
     def entry(self) -> str:
         """The line of a simulation file for a fault of the cell."""
         words = [f"fault: {self.kind.value}", f"at_cycle: {self.at_cycle}"]
-        if self.kind in WHOLE_CELL:
-            words += []
-        else:
-            words += [f"axis: J{self.node}"]
-        if self.cycles is None:
-            words += []
-        else:
-            words += [f"cycles: {self.cycles}"]
+        if self.kind not in WHOLE_CELL:
+            words.append(f"axis: J{self.node}")
+        if self.cycles is not None:
+            words.append(f"cycles: {self.cycles}")
         if self.kind is Inside.EMERGENCY:
-            words += [f"emcy_code: {self.value:#x}"]
-        else:
-            words += []
+            words.append(f"emcy_code: {self.value:#x}")
         return f"  - {{{', '.join(words)}}}\n"
 
 

@@ -34,6 +34,7 @@ from tests.vcan.log_reader import read_recorded
 RPDO1 = 0x200
 NEW_SETPOINT = 0x10  #: Bit of the controlword, which is behind the target in RPDO1
 TARGET_BYTES = 4
+HEARTBEAT_CONSUMER = 0x1016
 CYCLE_S = 0.02
 GUARD_S = 0.5
 LATENESS_S = 1.0
@@ -415,10 +416,24 @@ def allowed_codes(outcome: Round) -> set[int]:
         allowed.add(int(ExitCode.DATA_UNFIT))
     if kinds & STOPS_RUN or stalled_cycles > SILENT_CYCLES:
         allowed.add(int(ExitCode.DEVICE_FAULT))
+    if unguarded_nodes(outcome):
+        allowed.add(int(ExitCode.USAGE))
     for kind in kinds:
         if isinstance(kind, Act):
             allowed |= CODES.get(kind, set())
     return allowed
+
+
+def unguarded_nodes(outcome: Round) -> list[int]:
+    """Return the nodes that refused to watch the recorder's heartbeat.
+
+    Their axes move with an option alone.
+    """
+    return [
+        fault.node
+        for fault in outcome.injected
+        if fault.kind is Act.SDO_ABORT and fault.aborted[0] == HEARTBEAT_CONSUMER
+    ]
 
 
 def longest_stall_cycles(outcome: Round) -> float:
@@ -494,6 +509,10 @@ def judge_code(outcome: Round) -> None:
         say(f"(e) exit code {outcome.code}, expected one of {sorted(allowed)}: {outcome.said}")
     if not outcome.permitted and outcome.code in UNSTOPPED_CODES:
         say(f"(e) exit code {outcome.code} without permission to move: {outcome.said}")
+    if outcome.code == ExitCode.USAGE:
+        for node in unguarded_nodes(outcome):
+            if f"J{node}" not in outcome.said or "--unguarded" not in outcome.said:
+                say(f"(e) no message names J{node}, which is unguarded: {outcome.said}")
     aborts = [fault for fault in outcome.injected if fault.kind is Act.SDO_ABORT]
     if outcome.code == ExitCode.DEVICE_FAULT and kinds - AFTERWARDS == {Act.SDO_ABORT}:
         words = " ".join(outcome.said.split())

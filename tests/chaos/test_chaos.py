@@ -5,11 +5,12 @@ this part needs no CAN.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import chain, islice
 
 import pytest
 
-from tests.chaos.faults import CYCLES, KINDS, Act, Fault, Inside, rounds
+from tests.chaos.faults import CYCLES, KINDS, SETUP_OBJECTS, Act, Fault, Inside, rounds
 from tests.chaos.judge import ALLOWANCE_S, STOPS, Round, judge_code, judge_end, judge_stop
 from tests.vcan.judgement import FEEDBACK, SYNC, TPDO1
 from tests.vcan.listener import Frame
@@ -200,6 +201,29 @@ def test_each_condition_on_the_end_is_judged(made: Callable[[], Round], expected
     judge_end(judged)
     judge_code(judged)
     assert [line[: len(expected)] for line in judged.violations] == ([expected] if expected else [])
+
+
+REFUSED_UNGUARDED = "axes that are UNGUARDED: J1: no 1016h; pass --unguarded to move J1"
+
+
+@pytest.mark.parametrize(
+    ("aborted", "said", "expected"),
+    [
+        ((0x1016, 1), REFUSED_UNGUARDED, []),
+        ((0x1016, 1), "motion is refused", ["(e) no message names J1"]),
+        ((0x1A00, 1), REFUSED_UNGUARDED, ["(e) exit code 2, expected"]),
+    ],
+)
+def test_an_axis_that_refuses_to_watch_the_recorder_moves_with_an_option_alone(
+    aborted: tuple[int, int], said: str, expected: list[str]
+) -> None:
+    abort = replace(fault(Act.SDO_ABORT), node=1, value=SETUP_OBJECTS.index(aborted))
+    judged = outcome(abort, 0.01)
+    judged.code = 2
+    judged.said = said
+    judge_code(judged)
+    found = [line for line in judged.violations if line.startswith("(e)")]
+    assert [line[: len(start)] for line, start in zip(found, expected, strict=True)] == expected
 
 
 def test_a_fault_that_came_after_the_end_excuses_nothing() -> None:

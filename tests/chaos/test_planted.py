@@ -17,7 +17,7 @@ import pytest
 from mcap.writer import Writer
 
 from drivers.simulation.faults import FaultKind
-from tests.chaos.faults import NODES, Act, Fault, Inside
+from tests.chaos.faults import NODES, SETUP_OBJECTS, Act, Fault, Inside
 from tests.chaos.judge import (
     ENABLED,
     FIRST,
@@ -289,6 +289,14 @@ def abort_without_a_name(made: Scene) -> None:
     made.outcome.said = "error: set-up failed"
 
 
+def refuse_an_unguarded_axis_without_a_name(made: Scene) -> None:
+    abort = replace(KILLED, kind=Act.SDO_ABORT, value=SETUP_OBJECTS.index((0x1016, 1)))
+    made.outcome.faults = (abort,)
+    made.outcome.struck = [(abort, BEGAN_NS)]
+    made.outcome.code = 2
+    made.outcome.said = "error: motion is refused"
+
+
 def move_before_the_recorder(made: Scene) -> None:
     answer = FEEDBACK.pack(0, 0, ENABLED)
     made.outcome.frames.insert(0, Frame(BEGAN_NS - 1_000_000_000, TPDO1 + 1, answer))
@@ -401,6 +409,7 @@ PLANTS: list[tuple[Callable[[Scene], None], str]] = [
     (end_with_another_code, "(e)"),
     (show_a_traceback, "(e)"),
     (abort_without_a_name, "(e)"),
+    (refuse_an_unguarded_axis_without_a_name, "(e)"),
     (fail_to_write, "(e)"),
     (move_before_the_recorder, "(f)"),
     (move_without_permission, "(f)"),
