@@ -16,6 +16,7 @@ import pytest
 
 from drivers.canopen.bus import base_frame, open_bus
 from drivers.simulation.hub import Hub
+from tests.chaos.__main__ import is_excused
 from tests.chaos.clock import BUILT
 from tests.chaos.ends import EXTENDED, ChaosBus
 from tests.chaos.faults import KERNEL_ONLY, NEEDS_CLOCK, Act, Fault, Inside
@@ -24,10 +25,11 @@ from tests.chaos.processes import BUS_LOST, READY, Objects, Shared, Verb, hub_ru
 from tests.chaos.results import Row, append_row, read_rows
 from tests.chaos.screens import Screen, plain, screen_of
 from tests.vcan.cells import write_simulation
+from tests.vcan.host_stalls import HostStalls
 from tests.vcan.listener import HUB_CHANNEL, Frame, frames_of_hub, heard, listening
 
 ROOT = Path(__file__).parents[2]
-PATIENCE_S = 10.0
+PATIENCE_S = 60.0
 
 
 def until(true: Callable[[], bool], seconds: float = PATIENCE_S) -> bool:
@@ -236,3 +238,29 @@ def test_an_sdo_abort_meets_one_object_while_it_is_in_force(tmp_path: Path) -> N
         assert objects.read(2, 0x6061, 0) is not None
         objects.close()
         assert cell.end(signal.SIGINT) == 0
+
+
+SLEPT = HostStalls(count=2, longest_s=0.08, lasted_s=18.0)
+AWAKE = HostStalls(count=0, longest_s=0.0, lasted_s=18.0)
+LATE = "(c) foreign EMCY of an axis: an axis is enabled 0.52 s after it"
+INVENTED = "(a, b) cycle 7, axis 1: (3, 0, 0) was not on the bus"
+
+
+@pytest.mark.parametrize(
+    ("violations", "stalls", "expected"),
+    [
+        ([LATE], SLEPT, True),
+        ([LATE, "(e) exit code 4, expected one of [0]: "], SLEPT, True),
+        ([LATE], AWAKE, False),
+        ([LATE, INVENTED], SLEPT, False),
+        (["(f) node 1 was enabled without permission to move"], SLEPT, False),
+        (["(g) the controller's file has gains of no single write: ()"], SLEPT, False),
+        (["(h) audit log: line 2 was changed"], SLEPT, False),
+        ([], SLEPT, False),
+    ],
+)
+def test_a_machine_that_stood_still_excuses_lateness_alone(
+    violations: list[str], stalls: HostStalls, expected: bool
+) -> None:
+    judged = Round((act(Act.EMCY),), violations=violations)
+    assert is_excused(judged, stalls) is expected
