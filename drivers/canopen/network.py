@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
+from functools import partial
 from typing import Self
 
 import can
@@ -31,6 +32,7 @@ from drivers.canopen.setup import (
     AxisSetup,
     HeartbeatGuard,
     Profiles,
+    insist,
     producer_of,
     read_consumers,
     refusal,
@@ -108,11 +110,10 @@ def _unrestored(axes: Sequence[Axis]) -> str:
     )
 
 
-@contextmanager
-def _collected(problems: list[DriverError]) -> Iterator[None]:
-    """Append a failure to the others, and go on."""
+def _attempt(step: Callable[[], object], problems: list[DriverError]) -> None:
+    """Do a step of closing; append its failure to the others, and go on."""
     try:
-        yield
+        insist(step, problems)
     except DriverError as problem:
         problems.append(problem)
 
@@ -644,25 +645,32 @@ class CanopenNetwork:
             axes = [axis for axis in axes if axis.node_id not in silent.node_ids]
         self.begin_stop(axes)
         for axis in axes:
-            with _collected(problems):
-                self.disable(axis)
+            _attempt(partial(self.disable, axis), problems)
         since_ns = self.link.clock()
         for axis in axes:
-            with _collected(problems):
-                self.link.command_nmt(axis.node_id, NmtCommand.ENTER_PRE_OPERATIONAL)
+            stop_pdos = partial(
+                self.link.command_nmt, axis.node_id, NmtCommand.ENTER_PRE_OPERATIONAL
+            )
+            _attempt(stop_pdos, problems)
         self.link.given_up = asked_again
         left: dict[str, tuple[str, ...]] = {}
         for axis in axes:
             left_s = max(self.bounds.nmt_s - (self.link.clock() - since_ns) * 1e-9, 0.0)
             if self._setups[axis.node_id].beats and self.link.allowed_s(left_s) > 0.0:
-                with _collected(problems):
-                    self.link.confirm_nmt(axis.node_id, NmtState.PRE_OPERATIONAL, since_ns, left_s)
+                confirm = partial(
+                    self.link.confirm_nmt,
+                    axis.node_id,
+                    NmtState.PRE_OPERATIONAL,
+                    since_ns,
+                    left_s,
+                )
+                _attempt(confirm, problems)
             left[axis.name] = self._setups[axis.node_id].restore(problems)
         if any(left.values()):
             if asked_again():
                 cause = "asked a second time"
             else:
-                cause = "some did not answer, or the time limit was over"
+                cause = "some did not answer, the bus failed, or the time limit was over"
             not_restored = {name: ", ".join(steps) for name, steps in left.items() if steps}
             names = "; ".join(f"{name}: {steps}" for name, steps in not_restored.items())
             remedy = "switch these drives off and on before they are used"

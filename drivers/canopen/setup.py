@@ -44,7 +44,7 @@ from drivers.canopen.pdo import (
 )
 from drivers.canopen.scale import ScaleReading
 from drivers.canopen.sdo import NO_SUCH_OBJECT, ObjectAccess
-from drivers.errors import DriverError, ObjectAccessError, SetupRefused, StateRefused
+from drivers.errors import BusError, DriverError, ObjectAccessError, SetupRefused, StateRefused
 from drivers.profiles.profile import Axis, DriveProfile, Identity, ObjectEntry
 
 HEARTBEAT_TIME = ObjectEntry(0x1017, 0, 16)
@@ -72,6 +72,23 @@ MODE_REMEDY = (
 
 Consumers = tuple[tuple[ObjectEntry, int], ...]
 """Entries of 1016h and their values: node id of a heartbeat producer << 16 | time in ms."""
+
+
+def insist(step: Callable[[], object], problems: list[DriverError]) -> None:
+    """Do a step of closing a network, once more if the bus fails during it.
+
+    A controller that goes off the bus, or the failure of one of several buses, is reported at any
+    time, and the step may still be possible. The report is appended to `problems` once.
+
+    Raises:
+        DriverError: of the step; BusError if the bus failed again.
+    """
+    try:
+        step()
+    except BusError as problem:
+        if str(problem) not in map(str, problems):
+            problems.append(problem)
+        step()
 
 
 def producer_of(value: int) -> int:
@@ -535,26 +552,29 @@ class AxisSetup:
         )
 
     def restore(self, problems: list[DriverError]) -> tuple[str, ...]:
-        """Restore all settings; returns the names of those that are left when the amplifier falls
-        silent.
+        """Restore all settings; returns the names of those that are left.
 
-        The same is returned when the time for closing is over. Failures are appended to `problems`.
+        They are left when the amplifier falls silent, when the time for closing is over, or when
+        the bus fails again and again. Failures are appended to `problems`.
         """
         steps = list(self._restoring())
-        for number, (_, step) in enumerate(steps):
+        unreached: list[str] = []
+        for number, (name, step) in enumerate(steps):
             left = tuple(name for name, _ in steps[number:])
             if self._link.allowed_s(1.0) <= 0.0:
-                return left
+                return (*unreached, *left)
             try:
-                step()
+                insist(step, problems)
+            except BusError:
+                unreached.append(name)
             except DriverError as problem:
                 in_time = self._link.allowed_s(1.0) > 0.0
                 silent = isinstance(problem, ObjectAccessError) and problem.abort_code is None
                 if in_time or not silent:
                     problems.append(problem)
                 if silent:
-                    return left
-        return ()
+                    return (*unreached, *left)
+        return tuple(unreached)
 
     def _restoring(self) -> Iterator[tuple[str, Callable[[], object]]]:
         """Yield the steps that restore all settings, and their names; the heartbeat last."""

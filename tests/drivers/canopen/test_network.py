@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import copy
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import can
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from drivers.canopen.link import NmtState
 from drivers.canopen.network import Bounds, CanopenNetwork
@@ -674,6 +676,80 @@ def test_one_bus_that_fails_while_the_network_closes_does_not_leave_the_other_ax
     assert [node.statusword & 0x6F for node in bus.nodes] == expected
     assert [node.value(0x6060, 0) for node in bus.nodes] == [1 if given_up else 8] * 2
     assert reported == (2 if given_up else 1)
+
+
+@dataclass(frozen=True)
+class Closed:
+    """Two axes after their network was closed.
+
+    Attributes:
+        changed: by axis, the objects that are not as they were before.
+        powered: by axis.
+        notes: on the error that the network was closed for.
+    """
+
+    changed: tuple[set[tuple[int, int]], ...]
+    powered: tuple[bool, ...]
+    notes: str
+
+
+COMMANDED = {(0x6040, 0), (0x6041, 0)}  #: Controlword and statusword are no settings
+
+
+def closed_off_the_bus(reports_at: Collection[int]) -> Closed:
+    """Close a network of two axes with power while the controller reports that it is off the bus.
+
+    Args:
+        reports_at: places among the answers to SDO requests, counted from the beginning of the
+            closing, before each of which comes such a report.
+    """
+    network, bus = cell(2)
+    before = [copy.deepcopy(node.objects) for node in bus.nodes]
+    off = can.Message(arbitration_id=0x40, is_extended_id=True, is_error_frame=True, data=bytes(8))
+    answers = 0
+
+    def reporting(message: can.Message) -> tuple[can.Message, ...]:
+        nonlocal answers
+        if message.arbitration_id & ~0x7F != 0x580:
+            return (message,)
+        answers += 1
+        if answers - 1 in reports_at:
+            return (off, message)
+        return (message,)
+
+    with pytest.raises(BusError) as caught, network:
+        network.prepare()
+        for node in bus.nodes:
+            node.statusword = 0x0227
+        bus.tamper = reporting
+        raise BusError("bus A", "bus-off")
+    changed = []
+    for node, objects in zip(bus.nodes, before, strict=True):
+        differing = {key for key, value in objects.items() if node.objects[key] != value}
+        changed.append(differing - COMMANDED)
+    powered = tuple(node.statusword & 0x6F != 0x40 for node in bus.nodes)
+    return Closed(tuple(changed), powered, " ".join(getattr(caught.value, "__notes__", ())))
+
+
+@pytest.mark.parametrize("place", range(50))
+def test_one_report_of_bus_off_while_the_network_closes_leaves_no_setting_behind(
+    place: int,
+) -> None:
+    closed = closed_off_the_bus({place})
+    # Entries of a mapping behind their count stay as they were written.
+    assert closed.changed == closed_off_the_bus(()).changed
+    assert closed.powered == (False, False)
+
+
+@given(st.sets(st.integers(0, 80)))
+@settings(deadline=None, max_examples=60)
+def test_settings_that_many_reports_of_bus_off_leave_behind_are_named(places: set[int]) -> None:
+    closed = closed_off_the_bus(places)
+    undisturbed = closed_off_the_bus(()).changed
+    for name, changed, expected in zip(("J1", "J2"), closed.changed, undisturbed, strict=True):
+        if changed != expected:
+            assert "not restored" in closed.notes
+            assert name in closed.notes
 
 
 def test_giving_back_is_undisturbed_and_says_when_it_was_cut_short() -> None:
