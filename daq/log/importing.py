@@ -539,7 +539,7 @@ def _start_times(
 ) -> tuple[int, int, Timing | None]:
     """Return the first stamp and the wall time of the log [ns], and its timing.
 
-    Both times are 0 where they are unknown, and there is no timing then.
+    Both times are 0 where they are unknown; there is no timing without a time column.
     """
     if wanted.time is None or clock is None:
         return 0, 0, None
