@@ -270,8 +270,9 @@ def rollback(
     """
     target.check_fields()
     refused_details = {"asked": "rollback"}
-    subject = target.subject
-    if planned is not None:
+    if planned is None:
+        subject = target.subject
+    else:
         subject = planned.subject
     recorder = _Recorder(audit, who, now, subject)
     with recorder.refusals(refused_details):
