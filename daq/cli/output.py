@@ -26,12 +26,14 @@ from queue import SimpleQueue
 from types import TracebackType
 from typing import IO, TextIO
 
-REMARKS_BYTES = 1 << 20  #: Remarks that may wait for a reader
-PROGRESS_BYTES = 4096  #: With more than this waiting, no progress is drawn
-CHUNK_BYTES = 4096  #: Of one write: what a pipe takes as a whole
-#: Remarks, and what an interrupt has left, wait so long for a reader that takes nothing
+REMARKS_BYTES = 1 << 20  #: Output that may wait for a reader before remarks are left out
+PROGRESS_BYTES = 4096  #: Output that may wait for a reader before progress is not drawn
+CHUNK_BYTES = 4096  #: Largest single write: what a pipe takes as a whole
 PATIENCE_S = 2.0
-POLL_S = 0.002  #: Between two looks whether the reader has taken everything
+"""Time for which the end of a command waits for a reader that takes nothing:
+for remarks, and for what an interrupt has left.
+"""
+POLL_S = 0.002  #: Time between two looks whether the reader has taken everything
 
 
 class OutputKind(Enum):
@@ -39,7 +41,8 @@ class OutputKind(Enum):
 
     RESULT = auto()  #: Never left out
     REMARK = auto()  #: Left out where too much waits
-    LOSSES = auto()  #: The place of remarks that were left out
+    #: Stands in the place of remarks that were left out; the thread fills in how many lines
+    LOSSES = auto()
     END = auto()  #: The thread ends here
 
 
@@ -59,7 +62,8 @@ def losses_line(lines: int) -> str:
 class OutputWriter:
     """Writes to one file from a thread of its own.
 
-    Waiting is polling: a signal may end it at any instruction, and must not leave a lock taken.
+    Who waits for the thread polls: a signal may raise at any instruction of the wait, and a lock or
+    a condition that is waited for could then stay taken.
     """
 
     def __init__(
@@ -82,14 +86,14 @@ class OutputWriter:
         self._write = write
         self._clock = clock
         self._pieces: SimpleQueue[Piece] = SimpleQueue()
-        # Guards the numbers below; it is never held for longer than it takes to change them.
+        # Guards the three numbers that follow; it is taken only while they change.
         self._lock = threading.Lock()
-        self._waiting_bytes = 0
-        self._waiting_results = 0  # pieces
-        self._lost_lines = 0  # not yet said
+        self._waiting_bytes = 0  # put, and not yet written
+        self._waiting_results = 0  # pieces of results among them
+        self._unsaid_lines = 0  # left out, and no line has said so yet
         self._has_lost_result = False
-        self._is_abandoned = False
-        self._taken_bytes = 0  # by the reader, in all
+        self._is_closed = False  # the thread gives up what it cannot write
+        self._written_bytes = 0  # since the start
         self._thread = threading.Thread(target=self._run, name="output", daemon=True)
 
     def start(self) -> None:
@@ -107,24 +111,29 @@ class OutputWriter:
                 self._has_lost_result = True
                 raise self.error
             return
-        size_bytes = len(piece.content)
         with self._lock:
-            if piece.kind is OutputKind.REMARK:
-                # Until the losses are said, what comes later stays out as well: lines keep their
-                # order.
-                is_first = self._lost_lines == 0
-                is_full = (
-                    self._waiting_bytes > 0 and self._waiting_bytes + size_bytes > REMARKS_BYTES
-                )
-                if is_full or not is_first:
-                    if is_first:
-                        self._pieces.put(Piece(OutputKind.LOSSES))
-                    self._lost_lines += max(1, piece.content.count(b"\n"))
-                    return
+            if piece.kind is OutputKind.REMARK and self._must_leave_out(piece):
+                if self._unsaid_lines == 0:
+                    self._pieces.put(Piece(OutputKind.LOSSES))
+                self._unsaid_lines += max(1, piece.content.count(b"\n"))
+                return
             if piece.kind is OutputKind.RESULT:
                 self._waiting_results += 1
-            self._waiting_bytes += size_bytes
+            self._waiting_bytes += len(piece.content)
             self._pieces.put(piece)
+
+    def _must_leave_out(self, remark: Piece) -> bool:
+        """Whether there is no room for a remark; the lock is taken.
+
+        A remark that is larger than the room has it where nothing else waits.
+        """
+        if self._unsaid_lines > 0:
+            # Until the line about the losses is written, what comes later is left out as well, so
+            # that lines keep their order.
+            return True
+        if self._waiting_bytes == 0:
+            return False
+        return self._waiting_bytes + len(remark.content) > REMARKS_BYTES
 
     @property
     def is_behind(self) -> bool:
@@ -140,8 +149,9 @@ class OutputWriter:
         return not any(events & closed for _, events in poll.poll(0))
 
     @property
-    def _is_empty(self) -> bool:
-        return self._waiting_bytes == 0 and self._lost_lines == 0
+    def _is_all_written(self) -> bool:
+        """Whether nothing waits, the line about losses included."""
+        return self._waiting_bytes == 0 and self._unsaid_lines == 0
 
     def wait(self) -> None:
         """Wait until everything was written, for as long as the reader takes.
@@ -149,7 +159,7 @@ class OutputWriter:
         Raises:
             OSError: of the file, where a result was lost.
         """
-        self._wait(lambda: self._is_empty)
+        self._wait_until(lambda: self._is_all_written)
         self._require_results()
 
     def wait_for_results(self) -> None:
@@ -159,7 +169,7 @@ class OutputWriter:
             OSError: as `wait`.
         """
         if self.results_are_awaited:
-            self._wait(lambda: self._waiting_results == 0)
+            self._wait_until(lambda: self._waiting_results == 0)
         self._require_results()
 
     def close(self, patience_s: float = PATIENCE_S) -> None:
@@ -167,31 +177,39 @@ class OutputWriter:
         then end the thread.
         """
         try:
-            self._wait(lambda: self._is_empty, patience_s)
+            self._wait_until(lambda: self._is_all_written, patience_s)
         finally:
-            self._is_abandoned = True
+            self._is_closed = True
             self._pieces.put(Piece(OutputKind.END))
 
-    def _wait(self, is_done: Callable[[], bool], patience_s: float = math.inf) -> None:
-        taken_bytes = self._taken_bytes
-        last_s = self._clock()
+    def _wait_until(self, is_done: Callable[[], bool], patience_s: float = math.inf) -> None:
+        """Wait until something is done, the file has failed, or the reader takes nothing.
+
+        Args:
+            is_done: what is waited for.
+            patience_s: longest time in which the reader takes no byte; it begins again with each.
+        """
+        written_bytes = self._written_bytes
+        last_progress_s = self._clock()
         while not is_done() and self.error is None:
             now_s = self._clock()
-            if self._taken_bytes != taken_bytes:
-                taken_bytes = self._taken_bytes
-                last_s = now_s
-            if now_s - last_s > patience_s:
+            if self._written_bytes != written_bytes:
+                written_bytes = self._written_bytes
+                last_progress_s = now_s
+            if now_s - last_progress_s > patience_s:
                 return
             time.sleep(POLL_S)
 
     def _require_results(self) -> None:
+        """Raise the error of the file where a result is lost by it."""
         if self.error is None:
             return
         if self._waiting_results > 0 or self._has_lost_result:
             raise self.error
 
     def _run(self) -> None:
-        # The main thread handles them
+        """Write the pieces in their order, in the thread."""
+        # Signals are for the main thread.
         signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())
         while True:
             piece = self._pieces.get()
@@ -199,43 +217,50 @@ class OutputWriter:
                 return
             content = piece.content
             if piece.kind is OutputKind.LOSSES:
-                content = self._taken_losses()
+                content = self._take_losses()
             is_complete = self._write_out(content)
             is_result = piece.kind is OutputKind.RESULT
+            # `_require_results` reads both in another thread: a lost result is marked before it is
+            # no longer counted as waiting, so that one of them tells of it at any time.
             if is_result and not is_complete:
-                # Before it is no longer counted: one of both tells of it at any time
                 self._has_lost_result = True
             with self._lock:
                 self._waiting_bytes -= len(content)
-                self._waiting_results -= is_result
+                if is_result:
+                    self._waiting_results -= 1
 
-    def _taken_losses(self) -> bytes:
-        """Return the sentence about lines that were left out,
-        which counts as waiting from now on.
+    def _take_losses(self) -> bytes:
+        """Return the line about what was left out, which counts as waiting from now on;
+        later remarks are written again.
         """
         with self._lock:
-            content = self.losses_line(self._lost_lines).encode()
-            self._lost_lines = 0
+            content = self.losses_line(self._unsaid_lines).encode()
+            self._unsaid_lines = 0
             self._waiting_bytes += len(content)
         return content
 
     def _write_out(self, content: bytes) -> bool:
-        """Write a piece; return whether all of it was taken."""
+        """Write a piece; return whether all of it was written.
+
+        It was not where the file has failed, now or earlier, or the writer was closed.
+        """
         rest = memoryview(content)
-        while rest and self.error is None and not self._is_abandoned:
+        while rest and self.error is None and not self._is_closed:
             try:
-                written = self._write_once(bytes(rest[:CHUNK_BYTES]))
+                written_bytes = self._write_once(bytes(rest[:CHUNK_BYTES]))
             except OSError as error:
                 self.error = error
-            else:
-                self._taken_bytes += written
-                rest = rest[written:]
+                return False
+            self._written_bytes += written_bytes
+            rest = rest[written_bytes:]
         return not rest
 
     def _write_once(self, content: bytes) -> int:
+        """Return the number of bytes that the file has taken, 0 after a wait for it."""
         try:
             return self._write(self._descriptor, content)
-        except BlockingIOError:  # another program has made the file non-blocking
+        except BlockingIOError:
+            # Another program has made the file non-blocking.
             select.select([], [self._descriptor], [])
             return 0
 
@@ -260,9 +285,10 @@ class _QueuedFile(io.RawIOBase):
         return os.isatty(self._descriptor)
 
     def write(self, content: object) -> int:
-        taken = bytes(content)  # type: ignore[call-overload]  # a buffer, as typeshed has it since 3.12
-        self.writer.put(Piece(self._kind, taken))
-        return len(taken)
+        # The caller may use its buffer again: the piece is a copy.
+        copied = bytes(content)  # type: ignore[call-overload]  # a buffer, as typeshed has it since 3.12
+        self.writer.put(Piece(self._kind, copied))
+        return len(copied)
 
 
 class QueuedOutput:
@@ -273,13 +299,13 @@ class QueuedOutput:
     """
 
     def __init__(self) -> None:
-        self._before: tuple[TextIO, TextIO] = (sys.stdout, sys.stderr)
-        self._writers: list[tuple[os.stat_result, OutputWriter]] = []
+        self._direct_streams: tuple[TextIO, TextIO] = (sys.stdout, sys.stderr)
+        self._writers: list[tuple[os.stat_result, OutputWriter]] = []  # with the status of its file
 
     def __enter__(self) -> QueuedOutput:
-        self._before = (sys.stdout, sys.stderr)
-        sys.stdout = self._queued(sys.stdout, OutputKind.RESULT)
-        sys.stderr = self._queued(sys.stderr, OutputKind.REMARK)
+        self._direct_streams = (sys.stdout, sys.stderr)
+        sys.stdout = self._queued_stream(sys.stdout, OutputKind.RESULT)
+        sys.stderr = self._queued_stream(sys.stderr, OutputKind.REMARK)
         return self
 
     def __exit__(
@@ -289,7 +315,7 @@ class QueuedOutput:
             for _status, writer in self._writers:
                 writer.close()
         finally:
-            sys.stdout, sys.stderr = self._before
+            sys.stdout, sys.stderr = self._direct_streams
 
     def wait_for_results(self) -> None:
         """Wait until somebody has taken what was printed on stdout.
@@ -300,24 +326,27 @@ class QueuedOutput:
         for _status, writer in self._writers:
             writer.wait_for_results()
 
-    def _queued(self, stream: TextIO, kind: OutputKind) -> TextIO:
+    def _queued_stream(self, stream: TextIO, kind: OutputKind) -> TextIO:
+        """Return a stream whose text goes through a writer; the stream itself without a file."""
         try:
             descriptor = stream.fileno()
             status = os.fstat(descriptor)
             stream.flush()
-        except (AttributeError, OSError, ValueError):  # none, in memory, or closed
+        except (AttributeError, OSError, ValueError):
+            # There is no stream, it is in memory, or it is closed.
             return stream
         writer = self._writer_of(status, descriptor)
         file = _QueuedFile(writer, kind, descriptor, stream.name)
-        # RawIOBase is what `python -u` has there, too.
-        raw: IO[bytes] = file  # type: ignore[assignment]
+        # typeshed asks for a buffered file; `python -u` has an unbuffered one there, too.
+        buffer: IO[bytes] = file  # type: ignore[assignment]
         return io.TextIOWrapper(
-            raw, encoding=stream.encoding, errors=stream.errors, write_through=True
+            buffer, encoding=stream.encoding, errors=stream.errors, write_through=True
         )
 
     def _writer_of(self, status: os.stat_result, descriptor: int) -> OutputWriter:
-        for known, writer in self._writers:
-            if os.path.samestat(known, status):
+        """Return the writer of the file with this status; stdout and stderr may be one file."""
+        for known_status, writer in self._writers:
+            if os.path.samestat(known_status, status):
                 return writer
         writer = OutputWriter(descriptor)
         writer.start()
@@ -382,6 +411,6 @@ def say_losses_as(line: Callable[[int], str]) -> None:
 def write_if_taken(text: str) -> None:
     """Write a short text on stderr, outside `QueuedOutput`, unless that would block."""
     with suppress(AttributeError, OSError, ValueError):
-        _, ready, _ = select.select([], [sys.stderr], [], 0.0)
-        if ready:
+        _, writable, _ = select.select([], [sys.stderr], [], 0.0)
+        if writable:
             sys.stderr.write(text)

@@ -42,10 +42,10 @@ from daq.workflow.quick_look import HONEST_S, BlockMove, GainsSoFar, RunSoFar
 from drivers.messages import CellEvent, EventKind
 from ident.errors import IdentificationError
 
-CONNECT_S = 5.0  #: Time for the feed to accept
-END_S = 3.0  #: Time for the process to end
+CONNECT_S = 5.0  #: Longest time until the feed accepts the connection
+END_S = 3.0  #: Longest time for the process to end, before it is killed
 NICENESS = 10  #: The recorder comes first
-SHORTEST_S = 2.1  #: Of a block before it is looked at: the filters need that
+SHORTEST_S = 2.1  #: Duration of a block from which on its gains are estimated: the filters need it
 LOST = (
     "samples of this block were not seen in time; its log has them, and they count when it "
     "is complete"
@@ -63,18 +63,23 @@ class BlockWatch:
     def __init__(
         self, cell: Cell, payload: str, target_percent: float, honest_s: float = HONEST_S
     ) -> None:
-        """Begin before the first block; see `GainsSoFar` for the arguments."""
+        """Begin before the first block.
+
+        Args:
+            cell, payload, target_percent: see `GainsSoFar.of`.
+            honest_s: motion before the first figures [s].
+        """
         self._cell = cell
-        self._nothing = replace(GainsSoFar.of(cell, payload, target_percent), honest_s=honest_s)
-        self._recorded = self._nothing  # blocks that are complete
-        self._folded: tuple[str, ...] = ()  # digests of their logs
-        self._growing = self._nothing  # with the present block
+        self._no_blocks = replace(GainsSoFar.of(cell, payload, target_percent), honest_s=honest_s)
+        self._complete_blocks = self._no_blocks
+        self._complete_digests: tuple[str, ...] = ()  # of the logs of these blocks
+        self._with_present_block = self._no_blocks
         self._run: RunSoFar | None = None  # None where the run is no block of a session
-        self._place = BlockMove("", 0, 0)
-        self._causes: Mapping[str, str] = {}
-        self._problem = ""
-        self._number: int | None = None
-        self._looked = 0  # finished moves at the last look
+        self._block = BlockMove("", 0, 0)  # the present one
+        self._causes: Mapping[str, str] = {}  # why each axis takes long
+        self._problem = ""  # why an earlier block does not count
+        self._last_packet: int | None = None  # its number
+        self._moves_at_last_look = 0
 
     def take(self, packet: bytes) -> None:
         """Process one packet of the feed.
@@ -83,8 +88,9 @@ class BlockWatch:
             FeedUnfit: this version does not understand it.
         """
         found = read_packet(packet, len(self._cell.axes))
-        has_gap = self._number is not None and found.number > self._number + 1
-        self._number = found.number
+        is_packet_lost = self._last_packet is not None and found.number > self._last_packet + 1
+        self._last_packet = found.number
+        # The message first: it may begin the run that the samples of this packet belong to.
         if found.message is not None:
             if found.message.run is not None:
                 self._begin(found.message.run)
@@ -92,7 +98,7 @@ class BlockWatch:
                 self._take_event(event)
         if self._run is None:
             return
-        if has_gap:
+        if is_packet_lost:
             self._run.is_whole = False
         if found.rows is not None:
             self._run.take(found.rows)
@@ -100,36 +106,46 @@ class BlockWatch:
     def look(self) -> QuickLook | None:
         """Return a look at the gains if a move was finished since the last one; else None."""
         run = self._run
-        if run is None or run.finished_moves == self._looked:
+        if run is None or run.finished_moves == self._moves_at_last_look:
             return None
-        self._looked = run.finished_moves
-        place = replace(self._place, move=run.finished_moves)
-        nothing = QuickLook(
-            place.block, place.move, place.moves, self._recorded.motion_s, place.is_held_out
-        )
-        problem = self._problem
-        if not run.is_whole and not place.is_held_out:
-            problem = problem or LOST
-        if problem:
-            return replace(nothing, missing=problem)
-        if place.is_held_out:
-            return self._recorded.look(place, self._causes)
-        return self._look_at_growing(run, place, nothing)
+        self._moves_at_last_look = run.finished_moves
+        block = replace(self._block, move=run.finished_moves)
+        if self._problem:
+            return self._without_gains(block, self._problem)
+        if block.is_held_out:
+            return self._complete_blocks.look(block, self._causes)
+        if not run.is_whole:
+            return self._without_gains(block, LOST)
+        return self._look_at_present(run, block)
 
-    def _look_at_growing(
-        self, run: RunSoFar, place: BlockMove, nothing: QuickLook
-    ) -> QuickLook | None:
-        """Fold in the present block as far as it is recorded;
-        None before it is long enough for the filters.
+    def _without_gains(self, block: BlockMove, missing: str) -> QuickLook:
+        """Return a look that says why there are no gains."""
+        return QuickLook(
+            block.block,
+            block.move,
+            block.moves,
+            self._complete_blocks.motion_s,
+            block.is_held_out,
+            missing=missing,
+        )
+
+    def _look_at_present(self, run: RunSoFar, block: BlockMove) -> QuickLook | None:
+        """Fold in the present block as far as it is recorded, and look at the gains.
+
+        Returns:
+            The look; None while the block is too short for the filters.
         """
-        samples = run.run()
-        if samples is None or samples.time_s[-1] < SHORTEST_S:
+        so_far = run.run()
+        if so_far is None or so_far.time_s[-1] < SHORTEST_S:
             return None
         try:
-            self._growing = self._growing.with_run(samples, is_complete=False)
-            return self._growing.with_motion(samples).look(place, self._causes)
+            self._with_present_block = self._with_present_block.with_run(so_far, is_complete=False)
+            # Of the run, only what is new is folded in. Its motion is added as a whole: it is not
+            # stored, or it would count once for each look.
+            with_motion = self._with_present_block.with_motion(so_far)
+            return with_motion.look(block, self._causes)
         except IdentificationError as error:
-            return replace(nothing, missing=str(error))
+            return self._without_gains(block, str(error))
 
     def _take_event(self, event: CellEvent) -> None:
         if self._run is None:
@@ -141,52 +157,68 @@ class BlockWatch:
     def _begin(self, facts: RunFacts) -> None:
         """Begin a run; it is watched if it is a block of a session."""
         self._run = None
-        self._looked = 0
+        self._moves_at_last_look = 0
         self._problem = ""
         if facts.log is None:
             return
         log = Path(facts.log)
-        state = self._state_in(log.parent)
+        session_folder = log.parent
+        state = self._state_of(session_folder)
         if state is None:
             return
         blocks = {block.name: block for block in state.blocks}
-        block = blocks.get(log.stem)
-        if block is None:
+        present = blocks.get(log.stem)
+        if present is None:
             return
-        self._run = RunSoFar(self._cell, facts, block.name)
-        self._place = BlockMove(block.name, 0, facts.moves, block.holdout)
+        self._run = RunSoFar(self._cell, facts, present.name)
+        self._block = BlockMove(present.name, 0, facts.moves, present.holdout)
         self._causes = {gain.axis: gain.cause for gain in state.gains}
-        counted = {name for name, other in blocks.items() if not other.holdout}
-        digests = {run.sha256: run.name for run in state.runs if run.name in counted}
+        names_by_digest: dict[str, str] = {}
+        for run in state.runs:
+            block = blocks.get(run.name)
+            if block is not None and not block.holdout:
+                names_by_digest[run.sha256] = run.name
         try:
-            self._fold(log.parent, digests)
+            self._fold_complete(session_folder, names_by_digest)
         except (DaqError, IdentificationError) as error:
             self._problem = f"an earlier block cannot be used: {error}"
-        self._recorded = replace(self._recorded, scale=None)
+        # σ of the last search belongs to the blocks that it has seen, and to no others.
+        self._complete_blocks = replace(self._complete_blocks, scale=None)
         if state.gains and state.judged_blocks == len(state.runs):
             std_percent = np.array([gain.std_percent for gain in state.gains])
-            self._recorded = self._recorded.in_proportion(std_percent)
-        self._growing = self._recorded
+            self._complete_blocks = self._complete_blocks.in_proportion(std_percent)
+        self._with_present_block = self._complete_blocks
 
-    def _state_in(self, folder: Path) -> GuidedState | None:
+    def _state_of(self, folder: Path) -> GuidedState | None:
+        """Return the state of the guided session in a folder; None if none is there."""
         for session in sessions(folder.parent, self._cell.name):
             if session.folder == folder and isinstance(session.state, GuidedState):
                 return session.state
         return None
 
-    def _fold(self, folder: Path, digests: Mapping[str, str]) -> None:
-        """Fold in the logs of complete blocks, by their digests;
-        begin anew where one of them has gone.
+    def _fold_complete(self, folder: Path, names_by_digest: Mapping[str, str]) -> None:
+        """Fold the complete blocks of a session into their fit.
+
+        A block that is folded in cannot be taken out: where the log of one has gone or is another,
+        all are folded in again.
+
+        Args:
+            folder: of the session, with the logs.
+            names_by_digest: names of the blocks that count, by the digests of their logs.
+
+        Raises:
+            DaqError, IdentificationError: a block cannot be used; those before it are folded in.
         """
-        if not set(self._folded) <= set(digests):
-            self._recorded = self._nothing
-            self._folded = ()
-        for digest, name in digests.items():
-            if digest in self._folded:
+        is_any_gone = any(digest not in names_by_digest for digest in self._complete_digests)
+        if is_any_gone:
+            self._complete_blocks = self._no_blocks
+            self._complete_digests = ()
+        for digest, name in names_by_digest.items():
+            if digest in self._complete_digests:
                 continue
             run, _ = load_run(folder / f"{name}.mcap", self._cell)
-            self._recorded = self._recorded.with_run(run).with_motion(run)
-            self._folded = (*self._folded, digest)
+            self._complete_blocks = self._complete_blocks.with_run(run).with_motion(run)
+            self._complete_digests = (*self._complete_digests, digest)
 
 
 def tells_something_new(look: QuickLook, before: QuickLook | None) -> bool:
@@ -209,12 +241,18 @@ def follow_feed(
 ) -> None:
     """Read packets until the feed ends; look at the gains where nothing more waits to be read.
 
+    Args:
+        connection: to the feed; an empty packet is its end.
+        watch: takes the packets.
+        report: receives each look.
+
     Raises:
         FeedUnfit: a packet is of another version.
     """
     while True:
         connection.setblocking(True)
         packet = connection.recv(LARGEST_PACKET)
+        # Read all that waits before the look: an estimate takes longer than a packet.
         connection.setblocking(False)
         while packet:
             watch.take(packet)
@@ -270,7 +308,7 @@ class LiveGains:
         except OSError:
             return self
         self._thread = threading.Thread(
-            target=self._wait, args=(self._process,), name="live gains", daemon=True
+            target=self._show_looks, args=(self._process,), name="live gains", daemon=True
         )
         self._thread.start()
         return self
@@ -290,18 +328,25 @@ class LiveGains:
         if self._process.stdout is not None:
             self._process.stdout.close()
 
-    def _wait(self, process: subprocess.Popen[str]) -> None:
+    def _show_looks(self, process: subprocess.Popen[str]) -> None:
+        """Show each look that the process prints, and its end if the session did not end it."""
         assert process.stdout is not None
         for line in process.stdout:
             self._show(_LOOK.validate_json(line))
         code = process.wait()
+        # It ends with the feed, or by the signal of `__exit__`.
         if code not in (0, -signal.SIGTERM):
             self._show(QuickLook("", 0, 0, 0.0, missing=ENDED.format(code=code)))
 
 
 def main(arguments: list[str]) -> int:
-    """Follow the feed of a cell file, and print each look as a line of JSON;
-    1 where there is no feed.
+    """Follow the feed of a cell file, and print each look as a line of JSON.
+
+    Args:
+        arguments: those of `LiveGains`, as text.
+
+    Returns:
+        The exit code: 1 where there is no feed, or one that cannot be read.
     """
     cell_file, payload, target_percent = arguments
     os.nice(NICENESS)

@@ -4,6 +4,9 @@ A log holds int32. If the files hold angles, the count of each axis is the small
 with which the largest value still fits. The rounding error, half a count, is then at most 4.7e-10
 of that value, and a power of two scales without a rounding error of its own: raw = round(value /
 count).
+
+`wanted` is the content of the import description, in all functions of the import; its sections say
+which columns hold a quantity.
 """
 
 from __future__ import annotations
@@ -73,8 +76,15 @@ TEMPERATURE_HZ = 1.0
 """Rates at which the controller's own torque and temperatures are kept:
 enough for a slope and for a warm-up.
 """
-#: Stamps from 2001 to 2065 are since 1970; any others since some start
 UNIX_NS = range(10**18, 3 * 10**18)
+"""Stamps that are taken for a wall clock's, counted since 1970: the years 2001 to 2065.
+Any others count from the start of some computer or program.
+"""
+SMALLEST_MAGNITUDE = 1e-200
+"""Columns whose values are all at most this are taken for zeros,
+whose power of two may be below the range of a float.
+"""
+ZEROS_EXPONENT = -30  #: Power of two by which such a column is counted
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,8 +123,8 @@ def import_recording(
         TableUnfit, PositionImplausible: the files cannot be used.
         UsageError, OutputFailed: a log cannot be written.
     """
-    wanted = load_import(description)
-    _require_name_of_holdout(wanted, holdout)
+    stated = load_import(description)
+    _require_name_of_holdout(stated, holdout)
     if holdout is not None and os.path.realpath(holdout) == os.path.realpath(out):
         raise UsageError(
             str(holdout),
@@ -122,59 +132,72 @@ def import_recording(
             expected="a name for each of them",
             remedy="give `--holdout` another name than `--out`",
         )
-    path = cell_path or description.parent / wanted.cell
-    cell = load_cell(path)
-    wanted = with_columns(wanted, data, cell.axis_names)
-    _check_cell(wanted, cell, description)
-    wanted = in_order_of_axes(wanted, cell.axis_names)
-    files = _read_tables(wanted, data)
-    check_sizes(wanted, cell, files)
-    recorded = _recorded(wanted, cell, files)
-    rate_hz = recorded.used.rate_hz
-    digests = {name: file.digest for name, file in files.items()}
-    started_ns, started_wall_ns, timing = _start(wanted, files, recorded.clock)
-    sources = ", ".join(f"{name} ({d[:12]})" for name, d in digests.items())
-    all_digests = repr(sorted(digests.items())).encode()
+    cell_file = cell_path or description.parent / stated.cell
+    cell = load_cell(cell_file)
+    with_all_columns = with_columns(stated, data, cell.axis_names)
+    _check_cell(with_all_columns, cell, description)
+    wanted = in_order_of_axes(with_all_columns, cell.axis_names)
+    tables = _read_tables(wanted, data)
+    check_sizes(wanted, cell, tables)
+    recording = _judged_recording(wanted, cell, tables)
+    rate_hz = recording.used.rate_hz
+    digests = {name: table.digest for name, table in tables.items()}
+    started_ns, started_wall_ns, timing = _start_times(wanted, tables, recording.clock)
     payload = _payload(wanted, cell)
     run = RunInfo(
-        run_id=f"import-{sha256(all_digests)[:16]}",
+        run_id=_run_id(digests),
         rate_hz=rate_hz,
         payload=payload,
         operator=wanted.operator,
         software=software,
         started_wall_ns=started_wall_ns,
         started_monotonic_ns=started_wall_ns,
-        origin=f"imported as {wanted.name} from " + sources,
+        origin=_origin(wanted, digests),
         timing=timing,
     )
-    slow = _slow(wanted, cell, files, recorded.clock, rate_hz)
-    samples = _LogSamples(cell, bundle(path), recorded.kept, slow, run, started_ns)
-    rows = range(len(recorded.kept.counts))
-    of_holdout = None
+    slow_columns = _slow_columns(wanted, cell, tables, recording.clock, rate_hz)
+    samples = _LogSamples(cell, bundle(cell_file), recording.kept, slow_columns, run, started_ns)
+    all_rows = range(len(recording.kept.counts))
+    holdout_statistics = None
     if wanted.holdout is None or holdout is None:
-        statistics = samples.write(out, rows)
+        statistics = samples.write(out, all_rows)
     else:
-        first = _first_of_holdout(wanted, wanted.holdout.from_s, rate_hz, len(rows))
-        of_holdout = samples.write(holdout, rows[first:])
+        split = _first_row_of_holdout(wanted, wanted.holdout.from_s, rate_hz, len(all_rows))
+        holdout_statistics = samples.write(holdout, all_rows[split:])
         try:
-            statistics = samples.write(out, rows[:first])
+            statistics = samples.write(out, all_rows[:split])
         # An interrupt, too: one log without the other would look like a whole import.
         except BaseException:
             holdout.unlink()
             raise
     remarks: list[str] = []
-    for file in files.values():
-        remarks += file.remarks
-    remarks += recorded.remarks
-    remarks += fault_remarks(recorded.faults, recorded.used)
-    return Imported(statistics, timing, tuple(remarks), of_holdout)
+    for table in tables.values():
+        remarks += table.remarks
+    remarks += recording.remarks
+    remarks += fault_remarks(recording.faults, recording.used)
+    return Imported(statistics, timing, tuple(remarks), holdout_statistics)
+
+
+def _run_id(digests: Mapping[str, str]) -> str:
+    """Return the identity of a run by the digests of its files: the same files, the same run."""
+    all_digests = repr(sorted(digests.items()))
+    digest = sha256(all_digests.encode())
+    return f"import-{digest[:16]}"
+
+
+def _origin(wanted: ImportDescription, digests: Mapping[str, str]) -> str:
+    """Return where a log comes from: the description and the files, with their digests."""
+    sources = [f"{name} ({digest[:12]})" for name, digest in digests.items()]
+    return f"imported as {wanted.name} from " + ", ".join(sources)
 
 
 def _require_name_of_holdout(wanted: ImportDescription, holdout: Path | None) -> None:
     """Refuse a description with a held-out part that has no name,
     and a name without such a part.
     """
-    if (wanted.holdout is None) == (holdout is None):
+    has_part = wanted.holdout is not None
+    has_name = holdout is not None
+    if has_part == has_name:
         return
     subject = f"import description {wanted.name!r}"
     if holdout is None:
@@ -192,8 +215,10 @@ def _require_name_of_holdout(wanted: ImportDescription, holdout: Path | None) ->
     )
 
 
-def _first_of_holdout(wanted: ImportDescription, from_s: float, rate_hz: float, count: int) -> int:
-    """Return the first sample of the held-out part.
+def _first_row_of_holdout(
+    wanted: ImportDescription, from_s: float, rate_hz: float, count: int
+) -> int:
+    """Return the first row of the held-out part, of `count` rows at a rate.
 
     Raises:
         TableUnfit: one of the parts has too few samples.
@@ -211,52 +236,59 @@ def _first_of_holdout(wanted: ImportDescription, from_s: float, rate_hz: float, 
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class _SlowColumns:
+    """A quantity that is logged less often than the samples."""
+
+    quantity: Quantity
+    period_samples: int  #: from one reading to the next
+    values: FloatArray  #: at every sample [Nm or °C], shape (k, n)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class _LogSamples:
     """Samples of a recording, all of which or a part go into a log."""
 
     cell: Cell
     files: Mapping[str, bytes]  #: the cell's bundle
-    kept: Converted
-    slow: list[tuple[Quantity, int, FloatArray]]
-    run: RunInfo
-    started_ns: int
+    columns: Converted
+    slow: list[_SlowColumns]
+    run: RunInfo  #: the facts about the whole recording
+    started_ns: int  #: stamp of its first sample
 
     def write(self, out: Path, rows: range) -> RunStatistics:
-        """Write some samples into a new log.
+        """Write some rows of the recording into a new log, whose cycles count from 0.
 
         Raises:
             UsageError, OutputFailed: the log cannot be written.
         """
         step_ns = 1e9 / self.run.rate_hz
         run = self._run_of(rows)
-        readback = self.kept.readback
-        content = LogContent.of(self.cell, run, self.files, readback)
-        # A crash of an import loses no sample, so no clock is needed to flush in time.
-        with LogWriter(
-            out, content, self.kept.scale.joint_position_of, clock_ns=lambda: 0, keeps_part=False
-        ) as log:
-            silent = (0,) * len(self.cell.axes)
-            counts = self.kept.counts[rows.start : rows.stop].tolist()
-            current_raw = self.kept.current_raw[rows.start : rows.stop].tolist()
+        content = LogContent.of(self.cell, run, self.files, self.columns.readback)
+        joint_position = self.columns.scale.joint_position_of
+        # A crash of an import loses no sample: the log needs no clock to flush by, and leaves no
+        # `.part`.
+        with LogWriter(out, content, joint_position, clock_ns=lambda: 0, keeps_part=False) as log:
+            no_statusword = (0,) * len(self.cell.axes)
+            counts = self.columns.counts[rows.start : rows.stop].tolist()
+            current_raw = self.columns.current_raw[rows.start : rows.stop].tolist()
             for cycle, row in enumerate(rows):
                 time_ns = self.started_ns + round(row * step_ns)
-                log.readings(_readings(self.slow, row, time_ns))
+                log.readings(_slow_readings(self.slow, row, time_ns))
                 position = tuple(counts[cycle])
                 current = tuple(current_raw[cycle])
-                sample = Sample(cycle, time_ns, position, current, silent)
+                sample = Sample(cycle, time_ns, position, current, no_statusword)
                 log.write(sample)
             log.conclude(valid=True)
         return log.statistics
 
     def _run_of(self, rows: range) -> RunInfo:
-        """Return the facts about a part of the recording."""
-        if len(rows) == len(self.kept.counts):
+        """Return the facts about a part of the recording, which starts later than the whole."""
+        if len(rows) == len(self.columns.counts):
             return self.run
         later_ns = round(rows.start * 1e9 / self.run.rate_hz)
+        wall_ns = 0  # the time of day is unknown
         if self.run.started_wall_ns:
             wall_ns = self.run.started_wall_ns + later_ns
-        else:
-            wall_ns = 0
         timing = self.run.timing
         if timing is not None and timing.started_s is not None:
             timing = replace(timing, started_s=timing.started_s + later_ns * 1e-9)
@@ -292,55 +324,76 @@ class JudgedRecording:
     remarks: tuple[str, ...]  #: on what was mended besides
 
 
-def _recorded(wanted: ImportDescription, cell: Cell, files: dict[str, Table]) -> JudgedRecording:
-    """Judge and convert what the files hold.
+def _judged_recording(
+    wanted: ImportDescription, cell: Cell, tables: dict[str, Table]
+) -> JudgedRecording:
+    """Judge and convert the rows of the files.
+
+    Where a recording has several faults, the first check that fails names one of them.
 
     Raises:
         TableUnfit, PositionImplausible: the files cannot be used.
     """
-    table = files[wanted.position.files[0]]
-    position = section_values(wanted.position, files)
-    current = section_values(wanted.current, files)
-    require_changing(position, current, wanted, files)
-    require_own_columns(wanted.position, position, files)
-    require_own_columns(wanted.current, current, files)
+    file_position = section_values(wanted.position, tables)
+    current = section_values(wanted.current, tables)
+    require_changing(file_position, current, wanted, tables)
+    require_own_columns(wanted.position, file_position, tables)
+    require_own_columns(wanted.current, current, tables)
     remarks: tuple[str, ...] = ()
     if wanted.position.unit is PositionUnit.COUNTS:
-        position, remarks = signed_counts(position, wanted)
-        check_counts(position, wanted, files)
-    position = position * counting_signs(wanted.position.reversed, cell.axis_names)
-    clock = None
-    rate_hz = wanted.rate_hz
-    row = np.arange(len(position))
-    if wanted.time is not None:
-        numbers = np.hstack([file.values for file in files.values()])
-        clock = clock_of(files[wanted.time.file], wanted.time, numbers)
-        rate_hz = clock.timing.rate_hz
-        row = clock.row
-    assert rate_hz is not None  # load_import requires one of the two
-    time_s = None if clock is None else clock.time_s
-    used = UsedRows(row, time_s, rate_hz, wanted, files, cell)
-    check_current(current, wanted, files)
+        file_position, remarks = signed_counts(file_position, wanted)
+        check_counts(file_position, wanted, tables)
+    position = file_position * counting_signs(wanted.position.reversed, cell.axis_names)
+    clock = _file_clock(wanted, tables)
+    used = _used_rows(wanted, cell, tables, clock, len(position))
+    check_current(current, wanted, tables)
     sound = sound_columns(position, current, used)
-    kept = _converted(wanted, cell, position[row], current, clock)
-    joint_rad = kept.joint_rad
+    columns = _converted(wanted, cell, position[used.row], current, clock)
+    joint_rad = columns.joint_rad
     if len(wanted.position.files) == 1:
+        table = tables[wanted.position.files[0]]
         subject = str(table.path)
     else:
         subject = f"import description {wanted.name!r}"
     check_limits(subject, joint_rad, cell)
     check_motion(subject, joint_rad, cell)
-    check_steps(wanted, files, joint_rad, rate_hz, clock, cell)
+    check_steps(wanted, tables, joint_rad, used.rate_hz, clock, cell)
+    # After the limits of the robot, which may say more of a position that goes on displaced.
     require_mendable(sound.faults, used, displaced=True)
-    check_speed(subject, joint_rad, rate_hz, cell)
-    check_velocity(wanted, cell, files, clock, joint_rad, rate_hz)
-    current_a = kept.current_raw * kept.scale.current_per_unit
-    warn_of_unsigned(wanted.name, joint_rad, current_a, rate_hz, cell)
+    check_speed(subject, joint_rad, used.rate_hz, cell)
+    check_velocity(wanted, cell, tables, clock, joint_rad, used.rate_hz)
+    current_a = columns.current_raw * columns.scale.current_per_unit
+    warn_of_unsigned(wanted.name, joint_rad, current_a, used.rate_hz, cell)
     is_resampled = clock is not None and clock.timing.resampled
     if sound.faults and is_resampled:
         # Where rows stay as they are, a fit mends them; a spline would spread what is wrong.
-        kept = _converted(wanted, cell, sound.position[row], sound.current, clock)
-    return JudgedRecording(used, clock, kept, sound.faults, remarks)
+        columns = _converted(wanted, cell, sound.position[used.row], sound.current, clock)
+    return JudgedRecording(used, clock, columns, sound.faults, remarks)
+
+
+def _file_clock(wanted: ImportDescription, tables: Mapping[str, Table]) -> Clock | None:
+    """Return the clock of the time column; None without one.
+
+    A row is a repeated one only if the numbers of every file repeat.
+    """
+    if wanted.time is None:
+        return None
+    numbers = np.hstack([table.values for table in tables.values()])
+    return clock_of(tables[wanted.time.file], wanted.time, numbers)
+
+
+def _used_rows(
+    wanted: ImportDescription,
+    cell: Cell,
+    tables: Mapping[str, Table],
+    clock: Clock | None,
+    count: int,
+) -> UsedRows:
+    """Return the rows that a clock uses, or all `count` rows at the stated rate."""
+    if clock is not None:
+        return UsedRows(clock.row, clock.time_s, clock.timing.rate_hz, wanted, tables, cell)
+    assert wanted.rate_hz is not None  # load_import requires a time column or a rate
+    return UsedRows(np.arange(count), None, wanted.rate_hz, wanted, tables, cell)
 
 
 def _converted(
@@ -350,60 +403,66 @@ def _converted(
     current: FloatArray,
     clock: Clock | None,
 ) -> Converted:
-    """Convert positions of the rows that are used, and currents of all rows."""
+    """Convert columns of a file to those of a log.
+
+    Args:
+        wanted: with the units and the factors of the columns.
+        cell: the cell.
+        position: of the rows that are used, shape (rows used, n).
+        current: of all rows, shape (rows, n).
+        clock: chooses the rows of the currents, and resamples both; None without a time column.
+    """
     counts, count_rad = _counts(wanted, cell, position, clock)
     factors = wanted.current.factors(cell.axis_names)
-    scaled = on_clock(current, clock) * np.array(factors)
-    raw, unit = quantise(scaled)
+    scaled_current = on_clock(current, clock) * np.array(factors)
+    current_raw, current_per_unit = quantise(scaled_current)
     axes = []
     for index, axis in enumerate(cell.axes):
         rad_per_count = None if count_rad is None else float(count_rad[index])
-        axes.append(AxisReadback(axis.name, float(unit[index]), rad_per_count))
+        axes.append(AxisReadback(axis.name, float(current_per_unit[index]), rad_per_count))
     readback = Readback(tuple(axes))
     scale = scaling(cell, readback)
-    # As a fit reads them: the log keeps an encoder's counts as the counter had them, with its
-    # wraps.
-    continuous = counts
+    # The log keeps the counts of an encoder with the wraps of its counter; a fit reads them
+    # unwrapped. Angles do not wrap.
+    continuous_counts = counts
     if count_rad is None:
-        continuous = unwrapped(counts.astype(np.int32))
-    joint_rad = scale.joint_position(continuous)
-    return Converted(counts, raw, readback, scale, joint_rad)
+        continuous_counts = unwrapped(counts.astype(np.int32))
+    joint_rad = scale.joint_position(continuous_counts)
+    return Converted(counts, current_raw, readback, scale, joint_rad)
 
 
 def _read_tables(wanted: ImportDescription, data: Path) -> dict[str, Table]:
-    """Read every file of the description with the reader of its kind."""
-    part = wanted.keep
-    if part is not None and part.is_by_time and wanted.rate_hz is not None:
-        rows = rows_at_rate(wanted.rate_hz, part)
-        wanted = wanted.model_copy(update={"keep": _part_of_rows(rows)})
+    """Read every file of the description with the reader of its kind.
+
+    Returns:
+        The tables by the names of the files, in the order of the description, with as many rows
+        each.
+
+    Raises:
+        TableUnfit: a file cannot be read, has another number of rows, or too few.
+    """
     read: dict[str, Table] = {}
-    # The file with the stamps comes first: where times are kept, it says which rows of the others
-    # these are.
-    files = wanted.files()
-    for name in sorted(files, key=lambda one: wanted.time is None or one != wanted.time.file):
-        is_timed = wanted.time is not None and wanted.time.file == name
-        if is_timed:
-            time = wanted.time
-        else:
-            time = None
-        path = data / name
-        table = reader_of(path)(path, wanted, files[name], time)
-        read[name] = table
-        if time is not None and part is not None and part.is_by_time:
-            end = table.first_row + len(table.values)
-            rows = slice(table.first_row, end)
-            wanted = wanted.model_copy(update={"keep": _part_of_rows(rows)})
-    tables = {name: read[name] for name in files}
-    counts = {len(file.values) for file in tables.values()}
-    if len(counts) > 1:
-        paths = [str(file.path) for file in tables.values()]
-        row_counts = [f"{len(file.values)} rows in {name}" for name, file in tables.items()]
-        raise TableUnfit(
-            ", ".join(paths),
-            found=" and ".join(row_counts),
-            expected="as many in each",
-            remedy="one of them ends early, or they are of different runs; export them again",
-        )
+    part = wanted.keep
+    is_part_by_time = part is not None and part.is_by_time
+    if part is not None and is_part_by_time and wanted.rate_hz is not None:
+        wanted = _with_part_of_rows(wanted, rows_at_rate(wanted.rate_hz, part))
+    columns_of_files = wanted.files()
+    if wanted.time is not None:
+        # The file with the stamps comes first: where a part is chosen by time, it says which rows
+        # of the other files these are.
+        timed_file = wanted.time.file
+        path = data / timed_file
+        timed = reader_of(path)(path, wanted, columns_of_files[timed_file], wanted.time)
+        read[timed_file] = timed
+        if is_part_by_time:
+            end = timed.first_row + len(timed.values)
+            wanted = _with_part_of_rows(wanted, slice(timed.first_row, end))
+    for name, columns in columns_of_files.items():
+        if name not in read:
+            path = data / name
+            read[name] = reader_of(path)(path, wanted, columns, None)
+    tables = {name: read[name] for name in columns_of_files}
+    _require_equal_rows(tables)
     if wanted.time is not None:
         timed = tables[wanted.time.file]
         for name, table in tables.items():
@@ -420,58 +479,73 @@ def _read_tables(wanted: ImportDescription, data: Path) -> dict[str, Table]:
     return tables
 
 
-def _part_of_rows(rows: slice) -> KeptPart:
-    """Return the part of a recording that has these rows, counted from 0."""
-    return KeptPart(from_row=rows.start + 1, to_row=rows.stop)
+def _require_equal_rows(tables: Mapping[str, Table]) -> None:
+    """Refuse files of different lengths: a row of one belongs to the same row of the others."""
+    counts = {len(table.values) for table in tables.values()}
+    if len(counts) <= 1:
+        return
+    paths = [str(table.path) for table in tables.values()]
+    row_counts = [f"{len(table.values)} rows in {name}" for name, table in tables.items()]
+    raise TableUnfit(
+        ", ".join(paths),
+        found=" and ".join(row_counts),
+        expected="as many in each",
+        remedy="one of them ends early, or they are of different runs; export them again",
+    )
 
 
-def _slow(
+def _with_part_of_rows(wanted: ImportDescription, rows: slice) -> ImportDescription:
+    """Return a description that keeps these rows, counted from 0, instead of a part by time."""
+    part = KeptPart(from_row=rows.start + 1, to_row=rows.stop)
+    return wanted.model_copy(update={"keep": part})
+
+
+def _slow_columns(
     wanted: ImportDescription,
     cell: Cell,
-    files: dict[str, Table],
+    tables: Mapping[str, Table],
     clock: Clock | None,
     rate_hz: float,
-) -> list[tuple[Quantity, int, FloatArray]]:
-    """Return torques of the motors [Nm] and temperatures [°C] at every sample,
-    each with its period in samples.
-    """
-    found = []
-    if (torque := wanted.torque) is not None:
+) -> list[_SlowColumns]:
+    """Return torques of the motors [Nm] and temperatures [°C], where the files have them."""
+    slow = []
+    torque = wanted.torque
+    if torque is not None:
         factors = np.array(torque.factors(cell.axis_names))
-        values = on_clock(section_values(torque, files), clock) * factors
+        torque_nm = on_clock(section_values(torque, tables), clock) * factors
         if torque.side is Side.JOINT:
-            values = values @ np.linalg.inv(cell.ratio)  # τ_joint = Rᵀ τ_motor (eq. 24)
-        every = max(1, round(rate_hz / TORQUE_HZ))
-        found.append((Quantity.TORQUE, every, values))
-    if (temperature := wanted.temperature) is not None:
-        values = on_clock(section_values(temperature, files), clock)
-        every = max(1, round(rate_hz / TEMPERATURE_HZ))
-        found.append((Quantity.TEMPERATURE, every, values))
-    return found
+            # τ_joint = Rᵀ τ_motor (eq. 24); in rows of samples, τ_motorᵀ = τ_jointᵀ R⁻¹.
+            torque_nm = torque_nm @ np.linalg.inv(cell.ratio)
+        period_samples = max(1, round(rate_hz / TORQUE_HZ))
+        slow.append(_SlowColumns(Quantity.TORQUE, period_samples, torque_nm))
+    temperature = wanted.temperature
+    if temperature is not None:
+        temperature_c = on_clock(section_values(temperature, tables), clock)
+        period_samples = max(1, round(rate_hz / TEMPERATURE_HZ))
+        slow.append(_SlowColumns(Quantity.TEMPERATURE, period_samples, temperature_c))
+    return slow
 
 
-def _readings(
-    slow: list[tuple[Quantity, int, FloatArray]], cycle: int, time_ns: int
-) -> Iterator[SlowReading]:
+def _slow_readings(slow: list[_SlowColumns], row: int, time_ns: int) -> Iterator[SlowReading]:
     """Yield the slow readings of a sample, where one of their periods begins."""
-    for quantity, every, values in slow:
-        if cycle % every == 0:
-            for axis, value in enumerate(values[cycle].tolist()):
-                yield SlowReading(time_ns, axis, quantity, value)
+    for columns in slow:
+        if row % columns.period_samples == 0:
+            for axis, value in enumerate(columns.values[row].tolist()):
+                yield SlowReading(time_ns, axis, columns.quantity, value)
 
 
-def _start(
-    wanted: ImportDescription, files: dict[str, Table], clock: Clock | None
+def _start_times(
+    wanted: ImportDescription, tables: Mapping[str, Table], clock: Clock | None
 ) -> tuple[int, int, Timing | None]:
     """Return the first stamp and the wall time of the log [ns], and its timing.
 
-    Both times are 0 where they are unknown, and there is no timing then.
+    Both times are 0 where they are unknown; there is no timing without a time column.
     """
     if wanted.time is None or clock is None:
         return 0, 0, None
-    file = files[wanted.time.file]
-    assert file.stamps is not None  # clock_of has used them
-    first_ns = file.stamps.first_ns
+    stamps = tables[wanted.time.file].stamps
+    assert stamps is not None  # clock_of has used them
+    first_ns = stamps.first_ns
     if first_ns < 0:
         return 0, 0, clock.timing
     timing = replace(clock.timing, started_s=first_ns * 1e-9)
@@ -481,9 +555,9 @@ def _start(
 
 
 def _quantum_exponent(largest: float) -> int:
-    """Return the power of two whose multiples up to LARGEST_RAW reach a magnitude."""
-    if largest <= 1e-200:
-        return -30
+    """Return the least e with largest ≤ LARGEST_RAW · 2ᵉ."""
+    if largest <= SMALLEST_MAGNITUDE:
+        return ZEROS_EXPONENT
     return ceil(log2(largest / LARGEST_RAW))
 
 
@@ -498,7 +572,7 @@ def quantise(values: FloatArray) -> tuple[IntArray, FloatArray]:
         quantum ≤ 2 / (2³¹ − 1) of the largest magnitude of the column.
     """
     largest = np.abs(values).max(axis=0)
-    exponents = [_quantum_exponent(top) for top in largest.tolist()]
+    exponents = [_quantum_exponent(magnitude) for magnitude in largest.tolist()]
     quantum = np.ldexp(1.0, np.array(exponents))
     raw = np.rint(values / quantum)
     return raw.astype(np.int64), quantum
@@ -513,37 +587,48 @@ def _counts(
     Between two samples the encoder's count is not a whole number: resampled counts are stored as
     angles, much finer, so that they are not rounded a second time.
     """
-    resampled = clock is not None and clock.timing.resampled
+    is_resampled = clock is not None and clock.timing.resampled
     if wanted.position.unit is PositionUnit.COUNTS:
-        if not resampled:
+        if not is_resampled:
             return position.astype(np.int64), None
-        turn = np.array([axis.counts_per_revolution for axis in cell.axes], dtype=np.float64)
+        turns = [axis.counts_per_revolution for axis in cell.axes]
+        counts_per_turn = np.array(turns, dtype=np.float64)
         motor_counts = unwrapped(position.astype(np.int32))
-        position = motor_counts * (2.0 * pi / turn)
+        angle_rad = motor_counts * (2.0 * pi / counts_per_turn)
     else:
-        position = in_si(position, wanted.position, cell)
+        angle_rad = in_si(position, wanted.position, cell)
     if wanted.position.side is Side.JOINT:
-        # Zero is that of the controller; `zero_offset_deg` leads from there to the URDF's.
-        position = position @ cell.ratio.T
-    return quantise(position if clock is None else clock.positions(position))
+        # q_motorᵀ = qᵀ Rᵀ, in rows of samples. Zero is that of the controller; `zero_offset_deg`
+        # leads from there to the URDF's.
+        angle_rad = angle_rad @ cell.ratio.T
+    if clock is not None:
+        angle_rad = clock.positions(angle_rad)
+    return quantise(angle_rad)
 
 
 def _payload(wanted: ImportDescription, cell: Cell) -> Payload | None:
+    """Return the payload that the description names; None if it names none.
+
+    Raises:
+        ConfigurationInconsistent: the cell has none of that name and mounting, or several.
+    """
     if wanted.payload is None:
         return None
-    matches = [
-        p
-        for p in cell.payloads
-        if p.name == wanted.payload and wanted.mounting in {None, p.mounting}
-    ]
+    matches = []
+    for mounted in cell.payloads:
+        is_mounting = wanted.mounting is None or wanted.mounting == mounted.mounting
+        if mounted.name == wanted.payload and is_mounting:
+            matches.append(mounted)
     if len(matches) == 1:
         return matches[0].payload
-    described = [f"{p.name} at {p.mounting}" for p in cell.payloads]
+    found = f"payload {wanted.payload!r}"
+    if wanted.mounting:
+        found += f", mounting {wanted.mounting!r}"
+    described = [f"{mounted.name} at {mounted.mounting}" for mounted in cell.payloads]
     known = ", ".join(described) or "none"
     raise ConfigurationInconsistent(
         f"import description {wanted.name!r}",
-        found=f"payload {wanted.payload!r}"
-        + (f", mounting {wanted.mounting!r}" if wanted.mounting else ""),
+        found=found,
         expected=f"one of the cell's ({known})",
         remedy="`payload: NAME` and, if needed, `mounting: NAME`, as in the cell file",
     )
@@ -553,32 +638,39 @@ def _check_columns(wanted: ImportDescription, description: Path) -> None:
     """Refuse a column that is read as two quantities, or as that of two axes:
     one of them would be made up.
     """
-    read: dict[tuple[Path, str], str] = {}
-    if wanted.time is None:
-        timed = []
-    else:
-        timed = [("time.column", wanted.time.file, wanted.time.column)]
-    for key, section in wanted.sections():
-        places = enumerate(section.places)
-        timed += [(f"{key}.columns[{index}]", file, column) for index, (file, column) in places]
-    for key, file, column in timed:
-        first = read.setdefault((Path(file), str(column)), key)
-        if first != key:
+    key_by_place: dict[tuple[Path, str], str] = {}
+    for key, file, column in _columns_by_key(wanted):
+        first_key = key_by_place.setdefault((Path(file), str(column)), key)
+        if first_key != key:
             raise ConfigurationInconsistent(
                 f"{description}: {key}",
-                found=f"column {column} of {file}, which is also {first}",
+                found=f"column {column} of {file}, which is also {first_key}",
                 expected="a column of its own for each quantity of each axis",
                 remedy="correct `columns` in the import description",
             )
 
 
+def _columns_by_key(wanted: ImportDescription) -> Iterator[tuple[str, str, Column]]:
+    """Yield each column that is read: its key in the description, its file, and itself."""
+    if wanted.time is not None:
+        yield "time.column", wanted.time.file, wanted.time.column
+    for key, section in wanted.sections():
+        for index, (file, column) in enumerate(section.places):
+            yield f"{key}.columns[{index}]", file, column
+
+
 def _check_cell(wanted: ImportDescription, cell: Cell, description: Path) -> None:
-    n = len(cell.axes)
+    """Refuse a description that does not fit the axes of the cell.
+
+    Raises:
+        ConfigurationInconsistent: names the key of the description.
+    """
+    axis_count = len(cell.axes)
     _check_columns(wanted, description)
     for key, section in wanted.sections():
-        if len(section.places) != n:
+        if len(section.places) != axis_count:
             found = f"{len(section.places)} columns"
-            expected = f"{n}, one for each axis of cell {cell.name!r}"
+            expected = f"{axis_count}, one for each axis of cell {cell.name!r}"
             raise ConfigurationInconsistent(
                 f"{description}: {key}.columns",
                 found=found,
@@ -586,12 +678,12 @@ def _check_cell(wanted: ImportDescription, cell: Cell, description: Path) -> Non
                 remedy="correct the description, or choose the cell with --cell",
             )
         reversed_axes = getattr(section, "reversed", ())
-        others = [name for name in reversed_axes if name not in cell.axis_names]
-        if others:
+        unknown_axes = [name for name in reversed_axes if name not in cell.axis_names]
+        if unknown_axes:
             axis_names = ", ".join(cell.axis_names)
             raise ConfigurationInconsistent(
                 f"{description}: {key}.reversed",
-                found=", ".join(others),
+                found=", ".join(unknown_axes),
                 expected=f"some of {axis_names}",
                 remedy="name axes of the cell, or correct the cell with --cell",
             )
@@ -633,15 +725,15 @@ def _check_cell(wanted: ImportDescription, cell: Cell, description: Path) -> Non
             remedy="add it to the cell file",
         )
     lengths = {PositionUnit.M, PositionUnit.MM, VelocityUnit.M, VelocityUnit.MM}
-    turning = [axis.name for axis in cell.axes if axis.unit is not MILLIMETRE]
-    for key, moved in (("position", wanted.position), ("velocity", wanted.velocity)):
-        if moved is None or moved.unit not in lengths:
+    revolute_axes = [axis.name for axis in cell.axes if axis.unit is not MILLIMETRE]
+    for key, motion in (("position", wanted.position), ("velocity", wanted.velocity)):
+        if motion is None or motion.unit not in lengths:
             continue
-        if turning or moved.side is Side.MOTOR:
-            turned = f"axis {turning[0]}" if turning else "a motor"
+        if revolute_axes or motion.side is Side.MOTOR:
+            turned = f"axis {revolute_axes[0]}" if revolute_axes else "a motor"
             raise ConfigurationInconsistent(
                 f"{description}: {key}.unit",
-                found=f"{moved.unit.value}, while {turned} turns",
+                found=f"{motion.unit.value}, while {turned} turns",
                 expected="rad or deg (m or mm for the prismatic axes among them), or counts",
                 remedy="correct the unit; convert the columns of the file to it",
             )
@@ -669,7 +761,9 @@ def in_order_of_axes(wanted: ImportDescription, axis_names: Sequence[str]) -> Im
 
 
 def _source(place: tuple[str, Column], bags: Set[str]) -> tuple[Path, str]:
-    """Return file and column, of a bag file and field."""
+    """Return the file and the column of a place; of a bag, the file and the field, without the
+    joint: a field of a bag is one quantity.
+    """
     file, column = place
     name = str(column)
     if file in bags:
@@ -724,7 +818,9 @@ def with_columns(
     bags = set[str]()
     for key, section in wanted.sections():
         readers = {file: reader_of(data / file) for file in section.files}
-        bags |= {file for file, reader in readers.items() if reader is read_bag}
+        for file, reader in readers.items():
+            if reader is read_bag:
+                bags.add(file)
         if isinstance(section, TemperatureColumns) and bags.intersection(section.files):
             fields = ", ".join(FIELDS)
             path = data / section.files[0]
@@ -736,20 +832,24 @@ def with_columns(
                 "file with it",
             )
         places = section.places
-        if len(places) == 1 < len(axis_names):
-            places = _of_all_axes(places[0], readers, axis_names)
+        if len(places) == 1 and len(axis_names) > 1:
+            places = _places_of_axes(places[0], readers, axis_names)
+        # Currents and torques are both in `effort`: joint states have no other field for them.
         field = key if key in FIELDS else "effort"
         columns: list[Column] = []
         for file, column in places:
-            columns.append(_of_field(column, field) if file in bags else column)
+            if file in bags:
+                columns.append(_field_and_joint(column, field))
+            else:
+                columns.append(column)
         files: str | tuple[str, ...] = section.file
         if isinstance(files, tuple):
             files = tuple(file for file, _ in places)
         changed[key] = replace(section, file=files, columns=tuple(columns))
-    whole = wanted.model_copy(update=changed)
-    _require_used_settings(whole, data)
-    _check_torque(whole, bags)
-    return whole
+    with_all_columns = wanted.model_copy(update=changed)
+    _require_used_settings(with_all_columns, data)
+    _check_torque(with_all_columns, bags)
+    return with_all_columns
 
 
 BAG_SETTINGS = ("topic", "publisher", "rhythm")  #: Of an import description, for bags alone
@@ -792,7 +892,7 @@ def _require_reader(
     )
 
 
-def _of_all_axes(
+def _places_of_axes(
     place: tuple[str, Column], readers: Mapping[str, Reader], axis_names: Sequence[str]
 ) -> tuple[tuple[str, Column], ...]:
     """Return the place of each axis, where one column may name all of them:
@@ -808,8 +908,8 @@ def _of_all_axes(
     return tuple((file, f"{column}.{name}") for name in names)
 
 
-def _of_field(column: Column, field: str) -> str:
-    """Return the column of a bag that a joint, or a field and a joint, name."""
+def _field_and_joint(column: Column, field: str) -> str:
+    """Return a column of a bag as `FIELD.JOINT`; `field` is that of a joint without one."""
     name = str(column)
     if name.partition(".")[0] in FIELDS:
         return name
@@ -822,17 +922,23 @@ def _check_torque(wanted: ImportDescription, bags: Set[str]) -> None:
     """
     if wanted.torque is None:
         return
-    read = {_source(place, bags) for place in wanted.current.places}
-    repeated = [place for place in wanted.torque.places if _source(place, bags) in read]
-    shared = dict.fromkeys(repeated)
-    if shared:
-        names = dict.fromkeys(_source(place, bags)[1] for place in shared)
-        files = dict.fromkeys(file for file, _ in shared)
-        columns = ", ".join(names)
-        sources = ", ".join(files)
+    current_sources = {_source(place, bags) for place in wanted.current.places}
+    # Dictionaries keep each name once, in the order of the axes.
+    shared_names: dict[str, None] = {}
+    shared_files: dict[str, None] = {}
+    for place in wanted.torque.places:
+        source = _source(place, bags)
+        if source in current_sources:
+            _, name = source
+            file, _ = place
+            shared_names[name] = None
+            shared_files[file] = None
+    if shared_names:
+        columns = ", ".join(shared_names)
+        files = ", ".join(shared_files)
         raise ConfigurationInconsistent(
             f"import description {wanted.name!r}: torque.columns",
-            found=f"{columns} of {sources}, which current is read from",
+            found=f"{columns} of {files}, which current is read from",
             expected="the controller's own torque, in columns (of a bag: in a field) of its own",
             remedy="name those columns, or leave `torque` out; no fit needs it",
         )

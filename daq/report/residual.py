@@ -39,14 +39,13 @@ from ident.effects.signals import session_began_s
 from ident.effects.unnamed import is_unnamed
 from ident.estimators.estimate import RelativeError
 
-_SHOWN = 6  #: Findings listed for each turn; the JSON has them all
-_SHOWN_RIVALS = 3
-#: Share of the squared residual; a candidate that would explain it, and failed a check, is named
+_LISTED_CANDIDATES = 6  #: For each turn; the JSON has them all
+_LISTED_RIVALS = 3  #: For each effect
 MUCH = 0.2
-#: Share of the squared residual; a candidate on few moves that explains less is not worth a
-#: sentence
+"""Share of the squared residual from which on a candidate that failed a check is named."""
 LITTLE = 0.005
-MOST = 0.75  #: Share of the folds on which such a candidate must lower the error
+"""Share of the squared residual from which on a candidate is named that too few moves show."""
+MOST = 0.75  #: Share of the folds on which a candidate that few moves show must lower the error
 SLIGHT = 0.1  #: Share of an error; an effect that lowers it by less is said to be small
 
 WHEN = ("before", "after")
@@ -62,14 +61,13 @@ def residual_view(
     if verbose:
         yield from turns_view(fitted)
         yield from map(Sentence, effect_sizes(calibration))
-    found = headline_of(fitted, account, calibration.effects)
-    axes = len(calibration.gains)
+    sentences = headline_of(fitted, account, calibration.effects)
     if verbose:
-        yield from found.parts()
+        yield from sentences.parts()
     else:
-        yield SentenceScreen(
-            found, max(SCREEN_LINES - axes - AROUND_SENTENCES, FEWEST_SENTENCE_LINES)
-        )
+        gain_lines = len(calibration.gains)
+        free_lines = SCREEN_LINES - gain_lines - AROUND_SENTENCES
+        yield SentenceScreen(sentences, max(free_lines, FEWEST_SENTENCE_LINES))
     statistics = (
         *statistical_sentences(fitted, account),
         *geometry_before_search(fitted, calibration.diagnoses),
@@ -80,10 +78,10 @@ def residual_view(
         yield ""
         yield before_after_table(account, fitted.cell.axis_names)
     yield ""
-    gains = "Drive gains"
+    heading = "Drive gains"
     if calibration.effects:
-        gains = "Drive gains with the effects"
-    yield gain_table(calibration.gains, title=f"{gains}; change % is from the nameplate")
+        heading = "Drive gains with the effects"
+    yield gain_table(calibration.gains, title=f"{heading}; change % is from the nameplate")
     yield from map(Sentence, sigma_notes(fitted))
     if not verbose:
         yield Sentence(
@@ -120,7 +118,7 @@ class Headline:
 
     def sentences(self) -> tuple[str, ...]:
         """Return all of them, in the order in which they are read."""
-        found = (
+        in_order = (
             *self.checks,
             *self.effects,
             *self.explained,
@@ -128,24 +126,32 @@ class Headline:
             *self.judged,
             *self.impossible,
             *self.refused,
+            *self.gains,
+            *self.to_record,
+            *self.ending,
         )
-        after = (*self.gains, *self.to_record, *self.ending)
-        return tuple(sentence for sentence in (*found, *after) if sentence)
+        # There is no sentence on gains that are held.
+        return tuple(sentence for sentence in in_order if sentence)
 
     def parts(self) -> Iterator[Sentence]:
-        """Return all of them as parts of a view."""
+        """Yield all of them as parts of a view, the checks in bold."""
         for sentence in self.sentences():
-            yield Sentence(sentence, "bold" if sentence in self.checks else "")
+            style = "bold" if sentence in self.checks else ""
+            yield Sentence(sentence, style)
 
     def by_weight(self) -> tuple[str, ...]:
         """Return them in the order in which a screen gets them:
         what decides on the calibration comes first.
         """
-        first = (self.together, *self.refused, *self.checks[:1], *self.ending)
+        first_check = self.checks[:1]
+        other_checks = self.checks[1:]
         ordered = (
-            *first,
+            self.together,
+            *self.refused,
+            *first_check,
+            *self.ending,
             *self.judged,
-            *self.checks[1:],
+            *other_checks,
             *self.effects,
             *self.impossible,
             *self.explained,
@@ -168,15 +174,16 @@ class SentenceScreen:
         Args:
             width: columns of the terminal; None of a pipe or file, where a sentence is a line.
         """
-        left = self.room
+        lines_left = self.room
         fitting: set[str] = set()
         for sentence in self.headline.by_weight():
             lines = 1
             if width is not None:
                 lines = break_lines(sentence, width).count("\n") + 1
-            if lines <= left or not fitting:
+            # The first sentence is shown on any screen.
+            if lines <= lines_left or not fitting:
                 fitting.add(sentence)
-                left -= lines
+                lines_left -= lines
         parts = tuple(self.headline.parts())
         shown = tuple(part for part in parts if part.text in fitting)
         if len(shown) == len(parts):
@@ -186,18 +193,20 @@ class SentenceScreen:
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         """Render as many as fit the terminal."""
-        yield from self.chosen(options.max_width if console.is_terminal else None)
+        width = options.max_width if console.is_terminal else None
+        yield from self.chosen(width)
 
 
 def effect_sizes(calibration: Calibration) -> Iterator[str]:
-    """Name of each effect as in files and commands, its size ± σ,
+    """Yield the name of each effect as in files and commands, its size ± σ,
     and what these data cannot distinguish from it.
     """
     for effect in calibration.effects:
-        rivals = first_few(effect.ambiguity, _SHOWN_RIVALS, separator=", ")
+        sentence = f"{effect.axis}: {effect.name}: {size_text(effect, calibration)}"
+        rivals = first_few(effect.ambiguity, _LISTED_RIVALS, separator=", ")
         if rivals:
-            rivals = f"; not distinguishable from {rivals}"
-        yield f"{effect.axis}: {effect.name}: {size_text(effect, calibration)}{rivals}"
+            sentence += f"; not distinguishable from {rivals}"
+        yield sentence
 
 
 def turns_view(fitted: Fit) -> Iterator[RenderableType]:
@@ -209,7 +218,7 @@ def turns_view(fitted: Fit) -> Iterator[RenderableType]:
             yield ""
         title = f"Turn {number}: {CANDIDATES}"
         table = plain_table(CANDIDATE_HEADINGS, title=title)
-        for row in candidate_rows(fitted, step, _SHOWN):
+        for row in candidate_rows(fitted, step, _LISTED_CANDIDATES):
             table.add_row(*row)
         yield table
         yield from map(Sentence, turn_sentences(fitted, step))
@@ -296,7 +305,10 @@ def headline(fitted: Fit, account: Account, effects: Sequence[AcceptedEffect]) -
 
 
 def headline_of(fitted: Fit, account: Account, effects: Sequence[AcceptedEffect]) -> Headline:
-    """Return the sentences of `headline` by their subject."""
+    """Return the sentences of `headline` by their subject.
+
+    The arguments are those of `summary`.
+    """
     in_model = fitted.steps[-1].after.effects
     checks = list(diagnosis_texts(fitted.diagnoses))
     if any(is_correction(placed) for placed in in_model):
@@ -305,70 +317,89 @@ def headline_of(fitted: Fit, account: Account, effects: Sequence[AcceptedEffect]
             "The model corrects the description of the robot: gains and errors below are those of "
             "the corrected one. Correct the cell file all the same, and fit again."
         )
-    found: list[str] = []
-    for step, turn in zip(fitted.steps, account.turns, strict=True):
-        if step.accepted is not None and turn is not None:
-            added = [placed for placed in turn.added if placed in in_model]
-            found += [_effect_sentence(fitted, account, turn, placed, step) for placed in added]
-    before, _ = _strictest_error(account.total.before)
-    after, where = _strictest_error(account.total.after)
-    noise_text = _noise_text(account)
-    noise = f" ({noise_text})"
-    if noise_text == UNKNOWN_NOISE:
-        noise = ""
-    ending = (*_skew_sentence(account.skew), *_holdout_verdict(fitted, account))
+    effect_sentences = _effect_sentences(fitted, account)
     judged = tuple(verdict_sentences(fitted))
-    impossible = _impossible_sentences(fitted)
-    explained = tuple(_explained_checks(fitted, account))
-    to_record = tuple(
-        f"Excitation: {one.words(fitted.cell.axis_names[one.axis])}." for one in fitted.uncertain
-    )
-    if not found:
-        none = "No structure found"
-        if judged:
-            none = "No effect is confirmed"
-        together = f"{none}: the error {where} is {after.total:.1f} %{noise}."
-        return Headline(
-            checks=tuple(checks),
-            effects=(),
-            together=together,
-            judged=judged,
-            impossible=impossible,
-            refused=(),
-            gains=(),
-            explained=explained,
-            to_record=to_record,
-            ending=ending,
-        )
-    change = error_change_text(before.total, after.total)
+    to_record = []
+    for gain in fitted.uncertain:
+        axis = fitted.cell.axis_names[gain.axis]
+        to_record.append(f"Excitation: {gain.words(axis)}.")
+    refused: tuple[str, ...] = ()
+    gains: tuple[str, ...] = ()
+    if effect_sentences:
+        refused = tuple(_refused_by_apply(effects))
+        gains = (gains_sentence(fitted, account),)  # an empty one for held gains
     return Headline(
         checks=tuple(checks),
-        effects=tuple(found),
-        together=f"All axes together: the error {where} {change}{noise}{_unconfirmed(account)}.",
+        effects=effect_sentences,
+        together=_together_sentence(
+            account, has_effects=bool(effect_sentences), is_judged=bool(judged)
+        ),
         judged=judged,
-        impossible=impossible,
-        refused=tuple(_to_be_refused(effects)),
-        gains=(gains_sentence(fitted, account),),  # empty for fixed gains
-        explained=explained,
-        to_record=to_record,
-        ending=ending,
+        impossible=_impossible_sentences(fitted),
+        refused=refused,
+        gains=gains,
+        explained=tuple(_explained_checks(fitted, account)),
+        to_record=tuple(to_record),
+        ending=(*_skew_sentence(account.skew), *_holdout_verdict(fitted, account)),
     )
+
+
+def _effect_sentences(fitted: Fit, account: Account) -> tuple[str, ...]:
+    """Return a sentence for each effect that a turn has added and the last model still has."""
+    in_model = fitted.steps[-1].after.effects
+    sentences = []
+    for step, turn in zip(fitted.steps, account.turns, strict=True):
+        if step.accepted is None or turn is None:
+            continue
+        for placed in turn.added:
+            if placed in in_model:
+                sentences.append(_effect_sentence(fitted, account, turn, placed, step))
+    return tuple(sentences)
+
+
+def _together_sentence(account: Account, *, has_effects: bool, is_judged: bool) -> str:
+    """Return the error of all axes together, and how much of it noise leaves.
+
+    Args:
+        account: of the search.
+        has_effects: whether the model has effects of the search.
+        is_judged: whether effects were found that held-out runs do not confirm.
+    """
+    before, _ = _strictest_error(account.total.before)
+    after, where = _strictest_error(account.total.after)
+    noise = ""
+    noise_text = _noise_text(account)
+    if noise_text != UNKNOWN_NOISE:
+        noise = f" ({noise_text})"
+    if has_effects:
+        change = error_change_text(before.total, after.total)
+        return f"All axes together: the error {where} {change}{noise}{_rise_within_noise(account)}."
+    if is_judged:
+        outcome = "No effect is confirmed"
+    else:
+        outcome = "No structure found"
+    return f"{outcome}: the error {where} is {after.total:.1f} %{noise}."
 
 
 def _explained_checks(fitted: Fit, account: Account) -> Iterator[str]:
-    """Take up what the fit before the search has named and the fit with the effects does not."""
-    named = {(one.name, one.axes) for one in fitted.diagnoses}
-    corrected: set[str] = set()
-    for one in fitted.diagnoses:
-        if one.name in OF_DESCRIPTION:
-            corrected.update(one.axes)
-    for one in fitted.diagnoses_before:
-        is_named_otherwise = one.name in OF_DESCRIPTION and not corrected.isdisjoint(one.axes)
-        if (one.name, one.axes) in named or is_named_otherwise:
+    """Yield what the fit before the search has named and the fit with the effects does not,
+    with the errors of its axes.
+    """
+    still_named = {(diagnosis.name, diagnosis.axes) for diagnosis in fitted.diagnoses}
+    # Axes of which the fit with the effects says that their description is wrong: what the earlier
+    # fit said of it is the same mistake under another name.
+    described_wrong: set[str] = set()
+    for diagnosis in fitted.diagnoses:
+        if diagnosis.name in OF_DESCRIPTION:
+            described_wrong.update(diagnosis.axes)
+    for earlier in fitted.diagnoses_before:
+        if (earlier.name, earlier.axes) in still_named:
             continue
-        subject = ", ".join((*one.runs, *one.axes)) or "the fit"
+        if earlier.name in OF_DESCRIPTION and not described_wrong.isdisjoint(earlier.axes):
+            continue
+        subject = ", ".join((*earlier.runs, *earlier.axes)) or "the fit"
         changes: list[str] = []
-        for axis in one.axes:
+        for axis in earlier.axes:
             place = fitted.cell.axis_names.index(axis)
             before, where = _strictest_error(account.total.before, place)
             after, _ = _strictest_error(account.total.after, place)
@@ -377,8 +408,8 @@ def _explained_checks(fitted: Fit, account: Account) -> Iterator[str]:
         errors = ""
         if changes:
             errors = f": {'; '.join(changes)}"
-        said = f"CHECK {subject}: {one.found} ({one.name})"
-        yield f"Without the effects, the fit said {said}. With them it does not{errors}."
+        check = f"CHECK {subject}: {earlier.found} ({earlier.name})"
+        yield f"Without the effects, the fit said {check}. With them it does not{errors}."
 
 
 def verdict_sentences(fitted: Fit) -> Iterator[str]:
@@ -410,16 +441,17 @@ def verdict_sentences(fitted: Fit) -> Iterator[str]:
 
 
 def statistical_sentences(fitted: Fit, account: Account) -> tuple[str, ...]:
-    """What was not added and why, what would have been detected,
+    """Return what was not added and why, what would have been detected,
     and what the noise and the gears hide.
     """
     last = fitted.steps[-1]
     sentences: list[str] = []
     for step in fitted.steps:
-        sentences += _set_aside(fitted, step)
-    sentences += [*_choice_sentence(fitted, account), _silence(fitted)]
+        sentences += _rejected_sentences(fitted, step)
+    sentences += _choice_sentence(fitted, account)
+    sentences.append(_end_of_search(fitted))
     sentences += _unconfirmed_skew(account.skew)
-    sentences += _refused(fitted)
+    sentences += _failed_checks(fitted)
     sentences += _on_few_moves(fitted)
     sentences += gear_sentences(fitted)
     sentences += floor_sentences(account, fitted.cell.axis_names)
@@ -434,7 +466,7 @@ def statistical_sentences(fitted: Fit, account: Account) -> tuple[str, ...]:
     return tuple(sentences)
 
 
-def _unconfirmed(account: Account) -> str:
+def _rise_within_noise(account: Account) -> str:
     """Say of a rise of the held-out error that it is within its noise;
     empty for a fall, or a rise by more.
     """
@@ -447,29 +479,35 @@ def _unconfirmed(account: Account) -> str:
     return f", within its noise{size}: the effects are kept, but not confirmed"
 
 
-def _to_be_refused(effects: Sequence[AcceptedEffect]) -> Iterator[str]:
+def _refused_by_apply(effects: Sequence[AcceptedEffect]) -> Iterator[str]:
     """Name the effects with which `apply` refuses a calibration
     (`daq.writeback.gates.fit.effect`).
     """
-    refused = [one for one in effects if not one.is_harmless]
-    errors = [
-        f"{one.error_after_percent:.2f} % with it, {one.error_before_percent:.2f} % without"
-        for one in refused
-    ]
-    names = [f"{one.name} on {one.axis}" for one in refused]
-    if refused:
-        more = "".join(
-            f"; {name}: {error}" for name, error in zip(names[1:], errors[1:], strict=True)
-        )
-        yield (
-            f"`apply` refuses a calibration with {names[0]}: on data that the fit did not use, the "
-            f"torque error is {errors[0]}{more}. Record more runs for the fit, or take `drivegain "
-            "fit`, which adds no effects."
-        )
+    errors_by_name: list[tuple[str, str]] = []
+    for effect in effects:
+        if not effect.is_harmless:
+            errors = (
+                f"{effect.error_after_percent:.2f} % with it, "
+                f"{effect.error_before_percent:.2f} % without"
+            )
+            errors_by_name.append((f"{effect.name} on {effect.axis}", errors))
+    if not errors_by_name:
+        return
+    first_name, first_errors = errors_by_name[0]
+    others = ""
+    for name, errors in errors_by_name[1:]:
+        others += f"; {name}: {errors}"
+    yield (
+        f"`apply` refuses a calibration with {first_name}: on data that the fit did not use, the "
+        f"torque error is {first_errors}{others}. Record more runs for the fit, or take `drivegain "
+        "fit`, which adds no effects."
+    )
 
 
-#: Difference of a gain from which it is said, although among all axes noise may make it
 NOTABLE_SIGMAS = 2.5
+"""Difference of a gain, in its σ, from which on it is said,
+although noise may make it on one of all axes.
+"""
 
 
 def gains_sentence(fitted: Fit, account: Account) -> str:
@@ -479,23 +517,26 @@ def gains_sentence(fitted: Fit, account: Account) -> str:
     if fitted.estimate.gains_fixed:
         return ""
     names = fitted.cell.axis_names
-    changes = list(zip(names, account.total.gains, strict=True))
-    changed = [
-        f"{axis} by {change.change_percent:+.1f} %"
-        for axis, change in changes
-        if change.significant
-    ]
+    shifts = dict(zip(names, account.total.gains, strict=True))
+    changed = []
+    for axis, shift in shifts.items():
+        if shift.significant:
+            changed.append(f"{axis} by {shift.change_percent:+.1f} %")
     among_all = f"more than noise (probability below {100 * FALSE_ALARM:g} % among all axes)"
     if changed:
         return (
             f"The effects change gains by {among_all}: {', '.join(changed)} of the gain "
             "without them."
         )
-    notable = [one for one in changes if _is_notable(one[1], fitted.cell.target_sigma_percent)]
+    notable = {}
+    for axis, shift in shifts.items():
+        if _is_notable(shift, fitted.cell.target_sigma_percent):
+            notable[axis] = abs(shift.change_percent)
     if not notable:
         return "With and without the effects, the gains are the same within noise."
-    axis, change = max(notable, key=lambda one: abs(one[1].change_percent))
-    size = with_deviation(change.change_percent, change.change_std_percent, sign="+")
+    axis = max(notable, key=notable.__getitem__)
+    largest = shifts[axis]
+    size = with_deviation(largest.change_percent, largest.change_std_percent, sign="+")
     return (
         f"The effects change no gain by {among_all}; the largest difference is {size} % of the "
         f"gain of {axis} without them."
@@ -511,24 +552,23 @@ def _is_notable(change: GainShift, target_percent: float) -> bool:
 
 
 def _choice_sentence(fitted: Fit, account: Account) -> Iterator[str]:
-    """Part of σ that comes from the choice of effects,
+    """Say which part of σ comes from the choice of effects,
     where it is a third of σ or more (σ is then 6 % larger).
     """
-    parts = zip(fitted.cell.axis_names, account.total.gains, strict=True)
     shares = []
-    for axis, part in parts:
-        if 3.0 * part.choice_std >= part.after_std > 0.0:
-            percent = 100.0 * part.choice_std / part.after_std
+    for axis, shift in zip(fitted.cell.axis_names, account.total.gains, strict=True):
+        if 3.0 * shift.choice_std >= shift.after_std > 0.0:
+            percent = 100.0 * shift.choice_std / shift.after_std
             shares.append(f"{percent:.0f} % of it on {axis}")
     if shares:
         listed = ", ".join(shares)
         yield (
             "σ of the gains includes the choice of the effects (squares add): "
-            f"{listed}.{_open_text(fitted)}"
+            f"{listed}.{_left_open_text(fitted)}"
         )
 
 
-def _open_text(fitted: Fit) -> str:
+def _left_open_text(fitted: Fit) -> str:
     """Name the effects that are not in the model and may be true; empty without any."""
     names = [placed.name_among(fitted.cell.place_names) for placed in fitted.steps[-1].left_open]
     if not names:
@@ -542,39 +582,46 @@ def _open_text(fitted: Fit) -> str:
     )
 
 
-def _set_aside(fitted: Fit, step: Step) -> Iterator[str]:
+def _rejected_sentences(fitted: Fit, step: Step) -> Iterator[str]:
     """Sentences on findings that did not join the model, where the last model still lacks them."""
-    axes = fitted.cell.place_names
+    places = fitted.cell.place_names
     last = fitted.steps[-1]
     for rejected in step.set_aside:
         finding = rejected.finding
         rival = rejected.rival
-        axis = finding.placed.axis_name(axes)
-        replaced = rival is not None and rival in last.after.effects
+        axis = finding.placed.axis_name(places)
+        effect = effect_text(finding.effect, places)
+        # Of an earlier turn, a finding is named where its rival is in the last model, and where it
+        # has a name itself.
+        is_rival_in_model = rival is not None and rival in last.after.effects
+        is_replaced = is_rival_in_model and not is_unnamed(finding.effect)
         if rival is not None and rejected.moved and step is last:
             yield (
-                f"{axis}: what looks like {effect_text(finding.effect, axes)} depends clearly more "
-                f"on {variable_text(rival.effect, axes)}, and was not added: it would move "
-                f"{rejected.moved_text(axes)}."
+                f"{axis}: what looks like {effect} depends clearly more "
+                f"on {variable_text(rival.effect, places)}, and was not added: it would move "
+                f"{rejected.moved_text(places)}."
             )
-        elif step is last or (replaced and not is_unnamed(finding.effect)):
+        elif step is last or is_replaced:
             yield (
-                f"{axis} may have {effect_text(finding.effect, axes)}: it would change the error "
+                f"{axis} may have {effect}: it would change the error "
                 f"of moves left out from {finding.error_before_percent:.1f} to "
-                f"{finding.error_after_percent:.1f} %, and was not added: {rejected.reason(axes)}."
+                f"{finding.error_after_percent:.1f} %, and was not added: "
+                f"{rejected.reason(places)}."
             )
 
 
 def _impossible_firsts(fitted: Fit) -> tuple[Finding, ...]:
-    """The first candidate of each axis in the last turn, where physics alone does not allow it."""
-    first: dict[int, Finding] = {}
+    """Return the first candidate of each axis in the last turn,
+    where an impossible sign or size is the only check that it failed.
+    """
+    first_by_axis: dict[int, Finding] = {}
     for finding in fitted.steps[-1].findings:
-        first.setdefault(finding.axis, finding)
-    return tuple(
-        finding
-        for finding in first.values()
-        if finding.impossible and finding.refusals == (finding.impossible,)
-    )
+        first_by_axis.setdefault(finding.axis, finding)
+    impossible = []
+    for finding in first_by_axis.values():
+        if finding.impossible and finding.refusals == (finding.impossible,):
+            impossible.append(finding)
+    return tuple(impossible)
 
 
 def _impossible_sentences(fitted: Fit) -> tuple[str, ...]:
@@ -590,26 +637,27 @@ def _impossible_sentences(fitted: Fit) -> tuple[str, ...]:
     return tuple(sentences)
 
 
-def _refused(fitted: Fit) -> Iterator[str]:
+def _failed_checks(fitted: Fit) -> Iterator[str]:
     """Sentences on candidates that failed a check: of each axis the strongest, where it would
     explain much of the residual.
     """
-    axes = fitted.cell.place_names
+    places = fitted.cell.place_names
     last = fitted.steps[-1]
-    # Those are reported with the reason already.
+    # Other sentences name these, with the reason.
     reported = [rejected.finding.placed for rejected in last.set_aside]
     reported += [finding.placed for finding in _impossible_firsts(fitted)]
-    strongest: dict[int, Finding] = {}
+    strongest_by_axis: dict[int, Finding] = {}
     for finding in last.findings:
-        failed = finding.explained >= MUCH and finding.refusals and finding.placed not in reported
-        if failed and (
-            finding.axis not in strongest or finding.explained > strongest[finding.axis].explained
-        ):
-            strongest[finding.axis] = finding
-    for finding in strongest.values():
-        name = finding.placed.axis_name(axes)
+        explains_much = finding.explained >= MUCH
+        if not explains_much or not finding.refusals or finding.placed in reported:
+            continue
+        strongest = strongest_by_axis.get(finding.axis)
+        if strongest is None or finding.explained > strongest.explained:
+            strongest_by_axis[finding.axis] = finding
+    for finding in strongest_by_axis.values():
+        name = finding.placed.axis_name(places)
         yield (
-            f"{name}: {effect_text(finding.effect, axes)} would explain "
+            f"{name}: {effect_text(finding.effect, places)} would explain "
             f"{100.0 * finding.explained:.0f} % of the squared residual, but failed a check: "
             f"{'; '.join(finding.refusals)}. The cause may be another one."
         )
@@ -617,18 +665,18 @@ def _refused(fitted: Fit) -> Iterator[str]:
 
 def _on_few_moves(fitted: Fit) -> Iterator[str]:
     """Name, for each axis, the best candidate that too few moves show, and say what to record."""
-    best: dict[int, Finding] = {}
+    best_by_axis: dict[int, Finding] = {}
     for finding in fitted.steps[-1].findings:
-        # `_refused` names a large one with all that it failed.
+        # `_failed_checks` names a large one with all that it failed.
         is_of_size = LITTLE <= finding.explained < MUCH
         helps = finding.left_out_fall > 0.0 and finding.folds_better >= MOST
         is_possible = not finding.impossible
         if finding.too_few_moves and is_of_size and helps and is_possible:
-            best.setdefault(finding.axis, finding)
-    axes = fitted.cell.place_names
-    for finding in best.values():
-        name = finding.placed.axis_name(axes)
-        effect = effect_text(finding.effect, axes)
+            best_by_axis.setdefault(finding.axis, finding)  # the findings are ranked
+    places = fitted.cell.place_names
+    for finding in best_by_axis.values():
+        name = finding.placed.axis_name(places)
+        effect = effect_text(finding.effect, places)
         yield f"These moves do not tell whether {name} has {effect}: {finding.too_few_moves}."
 
 
@@ -637,13 +685,17 @@ def kinds_of_error(fitted: Fit) -> Iterator[str]:
     torques.
     """
     ratio = fitted.identification.model.drive_train.ratio
-    motors = np.count_nonzero(ratio, axis=0)
-    names = [name for name, count in zip(fitted.cell.axis_names, motors, strict=True) if count > 1]
-    if names:
+    # A row of the ratio is a motor, a column a joint.
+    motors_of_joints = np.count_nonzero(ratio, axis=0)
+    coupled = []
+    for name, motors in zip(fitted.cell.axis_names, motors_of_joints, strict=True):
+        if motors > 1:
+            coupled.append(name)
+    if coupled:
         yield (
             "The errors of a search are those of the motors' currents. `fit`, `validate` and the "
             "certificate have those of the joints' torques, which differ where several motors act "
-            f"on a joint ({', '.join(names)})."
+            f"on a joint ({', '.join(coupled)})."
         )
 
 
@@ -675,6 +727,7 @@ def floor_sentences(account: Account, axes: Sequence[str]) -> Iterator[str]:
 
 
 def _holdout_verdict(fitted: Fit, account: Account) -> Iterator[str]:
+    """Say of effects that harm the held-out runs whether they were accepted all the same."""
     if account.holdout_change is None or not account.holdout_change.is_harm:
         return
     if fitted.accept_worse_holdout:
@@ -696,14 +749,14 @@ def _skew_sentence(skew: CurrentDelay | None) -> Iterator[str]:
     side = "before"
     if skew.seconds > 0.0:
         side = "after"
-    standing = "it was not added to the model"
+    in_model_text = "it was not added to the model"
     if skew.is_in_model:
-        standing = "it is among the effects"
+        in_model_text = "it is among the effects"
     delay_ms = 1e3 * abs(skew.seconds)
     std_ms = 1e3 * skew.std
     yield (
         f"Currents were sampled {delay_ms:.2f} ± {std_ms:.2f} ms {side} the positions, the same on "
-        f"every axis ({standing}). Tenths of a millisecond are a filter of the drive, several "
+        f"every axis ({in_model_text}). Tenths of a millisecond are a filter of the drive, several "
         "milliseconds a fault of the recording: check its stamps."
     )
 
@@ -738,6 +791,7 @@ def gear_sentences(fitted: Fit) -> Iterator[str]:
 
 
 def _gear_sentence(name: str, gear: GearLoss, *, in_model: bool) -> Iterator[str]:
+    """Say what is known of the efficiency of one gear; nothing where that is not known."""
     if in_model and gear.efficiency is not None and gear.gain_factor is not None:
         yield (
             f"If motor and load lose the same share, the gear of {name} has an efficiency of "
@@ -785,6 +839,7 @@ def error_rows(account: Account) -> dict[str, RelativeError]:
     rows["noise, at least"] = account.least_floor
     rows["noise, at least, held out"] = account.least_holdout_floor
     measured = {name: error for name, error in rows.items() if error is not None}
+    # A floor may be there, and be known of no axis.
     return {name: error for name, error in measured.items() if any(map(math.isfinite, error.axes))}
 
 
@@ -796,10 +851,12 @@ def _strictest_error(errors: RelativeErrors, place: int | None = None) -> tuple[
         place: of the axis that the error must be known of: one that rests in the held-out runs has
             none there.
     """
-    if errors.holdout is not None and (place is None or math.isfinite(errors.holdout.at(place))):
-        return errors.holdout, "on held-out runs"
-    if errors.left_out_runs is not None and errors.left_out_runs.together is not None:
-        return errors.left_out_runs.together, "on runs left out in turn"
+    holdout = errors.holdout
+    if holdout is not None and (place is None or math.isfinite(holdout.at(place))):
+        return holdout, "on held-out runs"
+    left_out_runs = errors.left_out_runs
+    if left_out_runs is not None and left_out_runs.together is not None:
+        return left_out_runs.together, "on runs left out in turn"
     return errors.cross_validated, "on moves left out in turn"
 
 
@@ -820,52 +877,66 @@ def error_change_text(before_percent: float, after_percent: float) -> str:
 def _effect_sentence(
     fitted: Fit, account: Account, turn: BeforeAfter, placed: PlacedEffect, step: Step
 ) -> str:
-    axes = fitted.cell.place_names
-    name = axes[placed.axis]
-    what = effect_text(placed.effect, axes)
-    if doubt := doubted_name(step, placed, axes):
-        what = f"a torque that depends on {variable_text(placed.effect, axes)} ({doubt})"
+    """Say what an effect is, and how the errors fall that it is judged by.
+
+    Args:
+        fitted: with the turns of the search.
+        account: of these turns.
+        turn: the errors before and after the turn that added the effect.
+        placed: the effect.
+        step: the turn.
+    """
+    places = fitted.cell.place_names
+    name = places[placed.axis]
+    effect = effect_text(placed.effect, places)
+    doubt = doubted_name(step, placed, places)
+    if doubt:
+        effect = f"a torque that depends on {variable_text(placed.effect, places)} ({doubt})"
     place = None
+    subject = "The recording"
     if placed.effect.has_axis:
         place = placed.axis
+        subject = name
     before, where = _strictest_error(turn.before, place)
     after, _ = _strictest_error(turn.after, place)
-    if is_correction(placed):  # it is judged by all motors together
-        subject = "The recording"
-        if placed.effect.has_axis:
-            subject = name
+    if is_correction(placed):
+        # A correction moves the torque of every motor: they judge it together.
         if f"{before.total:.1f}" == f"{after.total:.1f}":
-            return (
-                f"{subject} has "
-                f"{what}{_hardly_shown_text(fitted, placed, step, before, after, where)}."
-            )
+            shown = _hardly_shown_text(fitted, placed, step, before, after, where)
+            return f"{subject} has {effect}{shown}."
         change = error_change_text(before.total, after.total)
-        return f"{subject} has {what}: the error of all axes {where} {change}."
-    if not placed.effect.has_axis:
-        return (
-            f"The recording has {what}: the error {where} "
-            f"{error_change_text(before.total, after.total)}."
-        )
-    without = before.at(placed.axis)
-    with_it = after.at(placed.axis)
-    if (
-        is_unnamed(placed.effect)
-        and step.accepted is not None
-        and step.accepted.share_of_excess is not None
-    ):
-        what += (
-            f" (about {100.0 * step.accepted.share_of_excess:.0f} % of the residual beyond noise)"
-        )
-    if without * (1.0 - SLIGHT) < with_it <= without:
-        what += ", a small effect"
-    whose = "all axes"
-    if placed.axis < len(fitted.cell.axes):
-        whose = name
-    noise = _noise_text(account, placed.axis)
+        return f"{subject} has {effect}: the error of all axes {where} {change}."
+    if place is None:
+        change = error_change_text(before.total, after.total)
+        return f"{subject} has {effect}: the error {where} {change}."
     return (
-        f"{name} has {what}: the error of {whose} {where} {error_change_text(without, with_it)} "
-        f"({noise})."
+        f"{name} has {effect}{_size_remarks(placed, step, before, after)}: the error of "
+        f"{_judged_by(fitted, placed)} {where} "
+        f"{error_change_text(before.at(place), after.at(place))} ({_noise_text(account, place)})."
     )
+
+
+def _judged_by(fitted: Fit, placed: PlacedEffect) -> str:
+    """Return whose error an effect is judged by: its axis; all axes at a joint without a motor."""
+    if placed.axis < len(fitted.cell.axes):
+        return fitted.cell.place_names[placed.axis]
+    return "all axes"
+
+
+def _size_remarks(
+    placed: PlacedEffect, step: Step, before: RelativeError, after: RelativeError
+) -> str:
+    """Return what is said of the size of an effect on an axis; empty where nothing is."""
+    remarks = ""
+    accepted = step.accepted
+    if is_unnamed(placed.effect) and accepted is not None and accepted.share_of_excess is not None:
+        percent = 100.0 * accepted.share_of_excess
+        remarks += f" (about {percent:.0f} % of the residual beyond noise)"
+    without_it = before.at(placed.axis)
+    with_it = after.at(placed.axis)
+    if without_it * (1.0 - SLIGHT) < with_it <= without_it:
+        remarks += ", a small effect"
+    return remarks
 
 
 def _hardly_shown_text(
@@ -880,8 +951,12 @@ def _hardly_shown_text(
     its own σ, and the axis that shows it most.
     """
     final = fitted.steps[-1].after
-    sizes = coefficients(final if placed in final.effects else step.after, placed)
-    sigmas = math.hypot(*(one.value / one.std for one in sizes if one.std > 0.0))
+    fit_with_it = final if placed in final.effects else step.after
+    sigmas_of_coefficients = []
+    for coefficient in coefficients(fit_with_it, placed):
+        if coefficient.std > 0.0:
+            sigmas_of_coefficients.append(coefficient.value / coefficient.std)
+    sigmas = math.hypot(*sigmas_of_coefficients)
     certain = ""
     if sigmas:
         certain = f", by {sigmas:.0f} σ"
@@ -891,9 +966,10 @@ def _hardly_shown_text(
     )
     names = fitted.cell.axis_names
     falls = {}
-    for name, first, last in zip(names, before.axes, after.axes, strict=True):
-        falls[name] = 1.0 - last / first
-    falls = {name: fall for name, fall in falls.items() if fall > 0.0}
+    for name, before_percent, after_percent in zip(names, before.axes, after.axes, strict=True):
+        fall = 1.0 - after_percent / before_percent
+        if fall > 0.0:
+            falls[name] = fall
     if not falls:
         return text
     axis = max(falls, key=falls.__getitem__)
@@ -908,8 +984,10 @@ def doubted_name(step: Step, placed: PlacedEffect, axes: Sequence[str]) -> str:
     names = names_by_split(step)
     if len(names) < 2 or step.accepted is None or placed.axis != step.accepted.axis:
         return ""
-    counted = [f"{one.placed.name_among(axes)} ({one.splits} of {one.of})" for one in names]
-    return f"parts of the moves call it {' or '.join(counted)}"
+    names_with_counts = []
+    for name in names:
+        names_with_counts.append(f"{name.placed.name_among(axes)} ({name.splits} of {name.of})")
+    return f"parts of the moves call it {' or '.join(names_with_counts)}"
 
 
 def _noise_text(account: Account, place: int | None = None) -> str:
@@ -927,23 +1005,24 @@ def _noise_text(account: Account, place: int | None = None) -> str:
     if account.least_holdout_floor is not None and account.holdout_floor is not None:
         least = account.least_holdout_floor
         estimate = account.holdout_floor
-    least_percent = least.total
-    if place is not None:
+    if place is None:
+        least_percent = least.total
+        estimate_percent = estimate.total
+    else:
         least_percent = least.at(place)
+        estimate_percent = estimate.at(place)
     if math.isfinite(least_percent):
         return f"noise leaves at least {least_percent:.1f} %"
-    percent = estimate.total
-    if place is not None:
-        percent = estimate.at(place)
-    if math.isfinite(percent):
-        return f"noise leaves {percent:.1f} %, an estimate"
+    if math.isfinite(estimate_percent):
+        return f"noise leaves {estimate_percent:.1f} %, an estimate"
     return UNKNOWN_NOISE
 
 
 UNKNOWN_NOISE = "noise floor not known"
 
 
-def _silence(fitted: Fit) -> str:
+def _end_of_search(fitted: Fit) -> str:
+    """Say that the search ended too early, or which effects it would have found."""
     last = fitted.steps[-1]
     if last.accepted is not None:
         return (
@@ -957,10 +1036,10 @@ def _silence(fitted: Fit) -> str:
     ended = ""
     if last.ended:
         ended = f"The search ended early: {last.ended}. "
-    trained = last.after.fit_runs
-    clockless = len(trained) > 1 and session_began_s(trained) is None
+    fit_runs = last.after.fit_runs
+    has_no_clock = len(fit_runs) > 1 and session_began_s(fit_runs) is None
     unseen = ""
-    if clockless:
+    if has_no_clock:
         unseen = " The runs have no common clock: a warm-up over the session cannot be seen."
     return (
         f"{ended}Detection limit of an effect that the declared model cannot imitate, root mean "

@@ -86,24 +86,26 @@ class Plan:
     robot: CalibratedRobot | None = None
 
 
-DWELL_S = 0.1
+DWELL_S = 0.1  #: Rest after each move
 NEAR = 0.15  #: Standard deviation of a near target, as a share of the joint's range
-ROUND = 8  #: Proposals whose regressors are made at once
+ROUND = 8  #: Number of proposals whose regressors are made at once
 THINNING = 2  #: Every second row is enough to compare proposals by
 SHARPNESS = 8.0
 """The search lowers this norm of all gains' deviations, nearly the largest:
 the second worst counts a little.
 """
-MIN_PLANNED_MOVES = 5
+MIN_PLANNED_MOVES = 5  #: Random moves that a run must have room for
 WISHED_MOVES = 30  #: With so many, σ is judged by leaving moves out, and the search has a choice
 #: Random postures or ways that are tried from one place before it counts as shut in
 MAX_TRIES = 100
-MAX_RETREATS = 30
+MAX_RETREATS = 30  #: Moves that a random plan may take back before no way counts as clear
 MAX_STARTS = 10  #: Random plans that are begun before the run counts as too short
 #: Shares of its speed at which a move is tried that asks too much torque
 SLOWER = (1.0, 0.8, 0.6, 0.45, 0.3, 0.2)
-#: Decimals of targets in degrees (or mm) and of shares: what is judged is what the plan file says
 PLACES = 3
+"""Decimals to which targets in degrees (or mm), velocities and accelerations are rounded,
+as in the plan file: what is judged is what the file says.
+"""
 
 
 class Kind(Enum):
@@ -118,6 +120,7 @@ class Kind(Enum):
 
 
 KINDS = tuple(Kind)
+#: Probability of each kind, in the order of KINDS
 CHANCES = (0.2, 0.25, 0.2, 0.15, 0.1, 0.1)
 
 
@@ -202,142 +205,183 @@ class Search:
             PlanTooShort: it has no room for five moves.
             UsageError: no clear way is found.
         """
-        most: list[PlannedMove] = []
+        longest: list[PlannedMove] = []
         for _ in range(MAX_STARTS):
-            moves, paths = self._filled()
+            moves, paths = self._random_sequence()
             if len(moves) >= MIN_PLANNED_MOVES:
                 informations = self._experiment.informations(paths, THINNING)
                 return Draft(tuple(moves), tuple(paths), tuple(informations))
-            most = max(most, moves, key=len)
-        found = f"room for {len(most)} moves"
-        if len(most) == 1:  # which only says where the run starts
+            longest = max(longest, moves, key=len)
+        found = f"room for {len(longest)} moves"
+        if len(longest) == 1:  # which only says where the run starts
             found = "no room for a move"
-        shortage = WISHED_MOVES / max(len(most), 1)
-        longer_s = _tens(self._duration_s * shortage)
+        times_as_long = WISHED_MOVES / max(len(longest), 1)
+        longer_s = _up_to_tens(self._duration_s * times_as_long)
         expected = f"at least {MIN_PLANNED_MOVES}, better {WISHED_MOVES}"
         remedy = f"allow a longer run (some --duration {longer_s:.0f})"
         raise _unfit(self._cell, self._duration_s, found, expected, remedy, PlanTooShort)
 
-    def _filled(self) -> tuple[list[PlannedMove], list[Trapezoid]]:
+    def _random_sequence(self) -> tuple[list[PlannedMove], list[Trapezoid]]:
+        """Return clear random moves, one after the other, until the duration is full,
+        and the ways between them.
+
+        Raises:
+            UsageError: no clear way is found.
+        """
         moves = [self._clear_start()]
         paths: list[Trapezoid] = []
-        left = self._duration_s - DWELL_S
+        left_s = self._duration_s - DWELL_S
         retreats = 0
         while True:
-            move = self._clear_move(np.array(moves[-1].target_rad))
-            if move is not None:
-                path = path_of(self._cell, np.array(moves[-1].target_rad), move)
-                left -= path.duration_s + move.dwell_s
-                if left < 0.0:
-                    return moves, paths
-                moves.append(move)
-                paths.append(path)
+            here = np.array(moves[-1].target_rad)
+            move = self._clear_move(here)
+            if move is None:
+                # A corner that the random targets before it led into: take the last move back.
+                retreats += 1
+                if retreats > MAX_RETREATS:
+                    raise self._blocked("way")
+                if paths:
+                    left_s += paths.pop().duration_s + moves.pop().dwell_s
+                else:
+                    moves = [self._clear_start()]
                 continue
-            # A corner that the random targets before it led into.
-            retreats += 1
-            if retreats > MAX_RETREATS:
-                raise self._blocked("way")
-            if paths:
-                left += paths.pop().duration_s + moves.pop().dwell_s
-            else:
-                moves = [self._clear_start()]
+            path = path_of(self._cell, here, move)
+            left_s -= path.duration_s + move.dwell_s
+            if left_s < 0.0:
+                return moves, paths
+            moves.append(move)
+            paths.append(path)
 
     def improve(
         self, draft: Draft, tries: int, progress: Callable[[int, FloatArray], None]
     ) -> Draft:
         """Exchange moves; an exchange stays when it lowers the deviations and the run gets no
         longer than allowed.
+
+        Args:
+            draft: the moves to begin with.
+            tries: number of proposals.
+            progress: receives the number of proposals so far, and σ of each gain [%], shape (n,).
+
+        Returns:
+            The best moves that were found.
         """
-        best, worst = self._judge(draft, np.inf)
+        best_cost, best_std_percent = self._judge(draft, np.inf)
         done = 0
         while done < tries:
             count = min(ROUND, tries - done)
-            chosen = draft
-            # One a round: proposals that were made from the same moves do not go together.
+            # One exchange a round: proposals that were made from the same moves do not go together.
+            best_draft = draft
             proposals = [self._proposal(draft.moves) for _ in range(count)]
             for candidate in self._drafts(draft, proposals):
-                value, found = self._judge(candidate, best)
-                if value < best:
-                    chosen = candidate
-                    best = value
-                    worst = found
-            draft = chosen
+                cost, std_percent = self._judge(candidate, best_cost)
+                if cost < best_cost:
+                    best_draft = candidate
+                    best_cost = cost
+                    best_std_percent = std_percent
+            draft = best_draft
             done += count
-            progress(done, worst)
+            progress(done, best_std_percent)
         return draft
 
     def _judge(self, draft: Draft, to_beat: float) -> tuple[float, FloatArray]:
-        """Cost of the search, and the deviations [%]:
-        nearly the worst, raised where W is too badly conditioned.
+        """Return the cost of a draft, which the search lowers, and σ of each gain [%], shape (n,).
+
+        The cost is nearly the largest σ over target, raised where W is too badly conditioned.
+
+        Args:
+            draft: the moves.
+            to_beat: cost from which on the condition does not matter, and is not computed.
         """
         information = self._goal.recorded + np.sum(draft.informations, axis=0)
-        found = self._experiment.design.std_percent(information)
+        std_percent = self._experiment.design.std_percent(information)
         # Unseen gains are as bad as each other; the norm of inf would hide the rest.
-        bounded = np.minimum(self._goal.ratio(found), 1e6)
-        worst = np.max(bounded)
+        ratios = np.minimum(self._goal.ratio(std_percent), 1e6)
+        worst = np.max(ratios)
         # (Σ rᵖ)^(1/p), scaled by the worst so that nothing overflows
-        total = np.sum((bounded / worst) ** SHARPNESS)
-        value = float(worst * total ** (1.0 / SHARPNESS))
-        if value < to_beat:  # the condition can only raise it
+        total = np.sum((ratios / worst) ** SHARPNESS)
+        cost = float(worst * total ** (1.0 / SHARPNESS))
+        if cost < to_beat:  # the condition can only raise it
             condition = self._experiment.design.condition(information)
             excess = max(1.0, condition / self._largest_condition)
-            value *= excess**2
-        return value, found
+            cost *= excess**2
+        return cost, std_percent
 
     def _proposal(self, moves: tuple[PlannedMove, ...]) -> tuple[PlannedMove, ...]:
+        """Return moves with one random change.
+
+        The same seed gives the same plan: the random numbers are drawn in this order, and the move
+        is drawn for every kind, although not all of them need it.
+        """
         rng = self._rng
-        low = self._low
-        high = self._high
         kind = KINDS[int(rng.choice(len(KINDS), p=CHANCES))]
-        index, other = (int(number) for number in rng.integers(len(moves), size=2))
+        index, other_index = (int(number) for number in rng.integers(len(moves), size=2))
+        random_move = self._random_move()
         before = moves[:index]
         old = moves[index]
         after = moves[index + 1 :]
-        random = self._random_move()
         match kind:
             case Kind.ANEW:
-                changed: tuple[PlannedMove, ...] = (*before, random, *after)
+                return (*before, random_move, *after)
             case Kind.NEAR:
-                step = rng.normal(0.0, NEAR, len(low)) * (high - low)
-                is_moved = rng.random(len(low)) < 0.5
-                target = np.array(old.target_rad) + step * is_moved
-                near = self._written(np.clip(target, low, high))
-                changed = (*before, replace(old, target_rad=near), *after)
+                near_target = self._near_target(np.array(old.target_rad))
+                return (*before, replace(old, target_rad=near_target), *after)
             case Kind.SWING:
-                axis = int(rng.integers(len(low)))
-                inwards = 0.25 * float(rng.random()) * (high[axis] - low[axis])
-                target = np.array(old.target_rad)
-                previous = moves[max(index - 1, 0)].target_rad[axis]
-                middle = 0.5 * (low[axis] + high[axis])
-                if previous < middle:
-                    target[axis] = high[axis] - inwards
-                else:
-                    target[axis] = low[axis] + inwards
-                changed = (*before, replace(old, target_rad=self._written(target)), *after)
+                previous = moves[max(index - 1, 0)]
+                far_target = self._swung_target(old, previous)
+                return (*before, replace(old, target_rad=far_target), *after)
             case Kind.SPEED:
-                speedy = replace(old, velocity=random.velocity, acceleration=random.acceleration)
-                changed = (*before, speedy, *after)
+                other_speed = replace(
+                    old, velocity=random_move.velocity, acceleration=random_move.acceleration
+                )
+                return (*before, other_speed, *after)
             case Kind.INSERT:
-                changed = (*before, random, old, *after)
+                return (*before, random_move, old, *after)
             case Kind.SHIFT:
-                rest = (*before, *after)
-                changed = (*rest[:other], old, *rest[other:])
-        return changed
+                others = (*before, *after)
+                return (*others[:other_index], old, *others[other_index:])
+
+    def _near_target(self, target: FloatArray) -> tuple[float, ...]:
+        """Return a target that is moved by a random step in about half of the axes."""
+        step = self._rng.normal(0.0, NEAR, len(target)) * (self._high - self._low)
+        is_moved = self._rng.random(len(target)) < 0.5
+        near = target + step * is_moved
+        return self._rounded_target(np.clip(near, self._low, self._high))
+
+    def _swung_target(self, move: PlannedMove, previous: PlannedMove) -> tuple[float, ...]:
+        """Return the target of a move with one axis at the end of its range that is farther from
+        where the previous move leaves it, or within a quarter of the range of that end.
+        """
+        target = np.array(move.target_rad)
+        axis = int(self._rng.integers(len(target)))
+        low = self._low[axis]
+        high = self._high[axis]
+        inwards = 0.25 * float(self._rng.random()) * (high - low)
+        middle = 0.5 * (low + high)
+        if previous.target_rad[axis] < middle:
+            target[axis] = high - inwards
+        else:
+            target[axis] = low + inwards
+        return self._rounded_target(target)
 
     def _drafts(self, draft: Draft, proposals: Sequence[tuple[PlannedMove, ...]]) -> list[Draft]:
-        """The proposals that are short enough and whose new ways are clear,
-        with their information.
+        """Return the proposals that are short enough and whose new ways are clear and not too
+        heavy, with their information.
+
+        Args:
+            draft: the moves that the proposals were made from; most ways are theirs.
+            proposals: moves, in the order in which the drafts are returned.
         """
         known: dict[_Way, tuple[Trapezoid, FloatArray]] = {}
         pairs = pairwise(draft.moves)
         for pair, path, information in zip(pairs, draft.paths, draft.informations, strict=True):
             known[_way(pair)] = (path, information)
-        fresh: dict[_Way, Trapezoid] = {}
-        kept = []
+        clear: dict[_Way, Trapezoid] = {}  # new ways of all proposals
+        candidates: list[tuple[tuple[PlannedMove, ...], list[_Way]]] = []
         for moves in proposals:
             ways = [_way(pair) for pair in pairwise(moves)]
-            new: dict[_Way, Trapezoid] = {}
-            lengths_s = []
+            new: dict[_Way, Trapezoid] = {}  # those of this proposal
+            moving_s = []
             for way in ways:
                 if way in known:
                     path, _ = known[way]
@@ -345,60 +389,68 @@ class Search:
                     start, move = way
                     path = path_of(self._cell, np.array(start), move)
                     new[way] = path
-                lengths_s.append(path.duration_s)
+                moving_s.append(path.duration_s)
             dwell_s = sum(move.dwell_s for move in moves)
             # The time is quick to check, the clearance is not.
-            if sum(lengths_s) + dwell_s > self._duration_s:
+            if sum(moving_s) + dwell_s > self._duration_s:
                 continue
             if not all(map(self._is_within, moves)):
                 continue
-            unchecked = [path for way, path in new.items() if way not in fresh]
+            unchecked = [path for way, path in new.items() if way not in clear]
             if all(map(self._is_clear, unchecked)):
-                kept.append((moves, ways))
-                fresh |= new
-        is_carried = self._is_carried(list(fresh.values()))
-        for way, fits in zip(tuple(fresh), is_carried, strict=True):
-            if not fits:
-                del fresh[way]
-        usable = known.keys() | fresh.keys()
-        kept = [(moves, ways) for moves, ways in kept if usable.issuperset(ways)]
-        informations = self._experiment.informations(list(fresh.values()), THINNING)
-        for (way, path), information in zip(fresh.items(), informations, strict=True):
+                candidates.append((moves, ways))
+                clear |= new
+        # Torques and regressors of all new ways at once: that is much faster than one by one.
+        is_carried = self._is_carried(list(clear.values()))
+        new_paths = {way: clear[way] for way in compress(clear, is_carried)}
+        informations = self._experiment.informations(list(new_paths.values()), THINNING)
+        for (way, path), information in zip(new_paths.items(), informations, strict=True):
             known[way] = (path, information)
         drafts = []
-        for moves, ways in kept:
-            of_ways = [known[way] for way in ways]
-            paths, of_paths = zip(*of_ways, strict=True)
-            drafts.append(Draft(moves, paths, of_paths))
+        for moves, ways in candidates:
+            if all(way in known for way in ways):
+                paths, informations_of_ways = zip(*[known[way] for way in ways], strict=True)
+                drafts.append(Draft(moves, paths, informations_of_ways))
         return drafts
 
     def _is_clear(self, path: Trapezoid) -> bool:
+        """Whether nothing is in the way, and the loops of a closed chain close on it."""
         checker = self._experiment.scene.checker
         return checker.obstruction(path.start, path.end) is None
 
     def _clear_start(self) -> PlannedMove:
+        """Return a random move to a clear posture.
+
+        Raises:
+            UsageError: none is found.
+        """
         for _ in range(MAX_TRIES):
             move = self._random_move()
             checker = self._experiment.scene.checker
             if checker.robot.is_constrained:
                 target = np.array(move.target_rad)
                 near = towards(checker, checker.home, target, self._low, self._high)
-                move = replace(move, target_rad=self._written(near))
+                move = replace(move, target_rad=self._rounded_target(near))
             if not self._is_within(move):
                 continue
-            [margin_m] = checker.margins(np.array([move.target_rad]))
+            posture = np.array([move.target_rad])
+            margin_m = checker.margins(posture)[0]
             if margin_m > 0.0:
                 return move
         raise self._blocked("posture")
 
     def _clear_move(self, start: FloatArray) -> PlannedMove | None:
+        """Return a random move on a clear way that the drives can carry;
+        None where none is found.
+        """
         for _ in range(MAX_TRIES):
             move = self._random_move()
             checker = self._experiment.scene.checker
             target = np.array(move.target_rad)
-            if checker.robot.is_constrained:  # a way to a far target often leaves the workspace
+            if checker.robot.is_constrained:
+                # A way to a far target often leaves the workspace.
                 target = towards(checker, start, target, self._low, self._high)
-                move = replace(move, target_rad=self._written(target))
+                move = replace(move, target_rad=self._rounded_target(target))
             if np.array_equal(target, start) or not self._is_within(move):
                 continue
             if checker.obstruction(start, np.array(move.target_rad)) is not None:
@@ -411,10 +463,13 @@ class Search:
         return None
 
     def _slow_enough(self, start: FloatArray, move: PlannedMove) -> PlannedMove | None:
-        """The move as fast as the drives can carry it; None where they cannot even slowly."""
+        """Return the move as fast as the drives can carry it;
+        None where they cannot even slowly.
+        """
         for share in SLOWER:
             slower = _slower(move, share)
-            if self._is_carried([path_of(self._cell, start, slower)])[0]:
+            path = path_of(self._cell, start, slower)
+            if all(self._is_carried([path])):
                 return slower
         return None
 
@@ -427,9 +482,10 @@ class Search:
         return list(map(bool, is_carried))
 
     def _random_move(self) -> PlannedMove:
-        # Slow and fast moves both: friction is distinguished from inertia by moves of different
-        # speed and acceleration.
-        target = self._written(self._rng.uniform(self._low, self._high))
+        """Return a move to a random target, slow or fast: friction is distinguished from inertia by
+        moves of different speed and acceleration.
+        """
+        target = self._rounded_target(self._rng.uniform(self._low, self._high))
         velocity = self._speed * float(self._rng.uniform(0.35, 1.0))
         acceleration = self._acceleration * float(self._rng.uniform(0.4, 1.0))
         return PlannedMove(
@@ -444,21 +500,23 @@ class Search:
         other.
         """
         target = np.array(move.target_rad)
-        is_above = target >= self._allowed.lower
-        is_below = target <= self._allowed.upper
-        return bool(np.all(is_above & is_below))
+        is_above_lower = target >= self._allowed.lower
+        is_below_upper = target <= self._allowed.upper
+        return bool(np.all(is_above_lower & is_below_upper))
 
-    def _written(self, target: FloatArray) -> tuple[float, ...]:
-        """As the plan file will say it: what is judged is what is made."""
-        target = self._experiment.scene.checker.fitting(target)
-        written = []
-        for value, axis in zip(target.tolist(), self._cell.axes, strict=True):
+    def _rounded_target(self, target: FloatArray) -> tuple[float, ...]:
+        """Return a target as the plan file will say it: what is judged is what is made."""
+        fitting = self._experiment.scene.checker.fitting(target)
+        rounded = []
+        for position, axis in zip(fitting.tolist(), self._cell.axes, strict=True):
             si = axis.unit.si
-            written.append(round(value / si, PLACES) * si)
-        return tuple(written)
+            rounded.append(round(position / si, PLACES) * si)
+        return tuple(rounded)
 
     def _blocked(self, what: str) -> UsageError:
-        """Error that names the two bodies which are in the way most often."""
+        """Return the error that names the two bodies which are in the way most often,
+        or the axes that are too weak.
+        """
         found = f"no clear {what} among hundreds of random ones"
         scene = self._experiment.scene
         checker = scene.checker
@@ -481,24 +539,28 @@ class Search:
             return _unfit(
                 self._cell, self._duration_s, found, "room to move in", "widen the joint limits"
             )
-        pairs = Counter((one.first, one.second) for one in blocking)
-        (worst, times), *_ = pairs.most_common(1)
-        if worst[0] == CLOSURES:
+        counts = Counter((obstruction.first, obstruction.second) for obstruction in blocking)
+        pair, times = counts.most_common(1)[0]
+        first, second = pair
+        if first == CLOSURES:
             remedy = f"correct {_keys(blocking[0])} in the cell file"
             return _unfit(self._cell, self._duration_s, found, "poses that the loops allow", remedy)
-        of_worst = [one for one in blocking if (one.first, one.second) == worst]
-        farthest_mm = 1000.0 * max(one.distance_m for one in of_worst)
+        distances_m = []
+        for obstruction in blocking:
+            if (obstruction.first, obstruction.second) == pair:
+                distances_m.append(obstruction.distance_m)
+        farthest_mm = 1000.0 * max(distances_m)
         found += (
-            f": in {times} of {MAX_TRIES} {worst[0]} and {worst[1]} are at most "
+            f": in {times} of {MAX_TRIES} {first} and {second} are at most "
             f"{farthest_mm:.0f} mm apart"
         )
         minimum_mm = 1000.0 * checker.scene.minimum_m
         expected = f"at least {minimum_mm:.0f} mm"
-        return _unfit(self._cell, self._duration_s, found, expected, _room_remedy(scene, worst))
+        return _unfit(self._cell, self._duration_s, found, expected, _room_remedy(scene, pair))
 
     def _too_weak(self) -> list[str]:
-        """Names of the axes whose drives cannot carry most of some slow random ways,
-        or at least the most of them.
+        """Return the names of the axes whose drives cannot carry most of some slow random ways;
+        if there is none, of those that cannot carry the most of them.
         """
         paths: list[Trapezoid] = []
         start = np.array(self._random_move().target_rad)
@@ -508,7 +570,9 @@ class Search:
             start = np.array(move.target_rad)
         is_heavy = EFFORT_MARGIN * self._experiment.effort_shares(paths) > 1.0
         share_heavy = np.mean(is_heavy, axis=0)
-        limit = min(0.5, 0.99 * float(np.max(share_heavy)))
+        # Just below the largest share, so that the axis with it is named.
+        largest_share = float(np.max(share_heavy))
+        limit = min(0.5, 0.99 * largest_share)
         return list(compress(self._cell.axis_names, share_heavy > limit))
 
 
@@ -527,13 +591,13 @@ def _room_remedy(scene: CheckedScene, pair: tuple[str, str]) -> str:
     )
 
 
-def _tens(seconds: float) -> float:
+def _up_to_tens(seconds: float) -> float:
     """Round a duration up to tens of seconds, as a person would give it."""
     return 10.0 * math.ceil(seconds / 10.0)
 
 
 def longer_run_s(used_s: float, requested_s: float, ratio: float) -> float | None:
-    """Duration of a run in which σ is smaller by a ratio [s];
+    """Return the duration of a run in which σ is smaller by a ratio [s];
     None where it is longer than a plan may be.
 
     σ falls with the square root of the time.
@@ -543,9 +607,9 @@ def longer_run_s(used_s: float, requested_s: float, ratio: float) -> float | Non
         requested_s: duration that they had room for [s]; the longer run is longer than that.
         ratio: σ that the moves give over σ that is wanted, above 1.
     """
-    needed_s = _tens(used_s * ratio**2)
+    needed_s = _up_to_tens(used_s * ratio**2)
     if needed_s <= requested_s:
-        needed_s = _tens(requested_s + 1.0)
+        needed_s = _up_to_tens(requested_s + 1.0)
     return needed_s if needed_s <= LONGEST_S else None
 
 
@@ -557,15 +621,19 @@ def _unfit(
     remedy: str,
     kind: type[UsageError] = UsageError,
 ) -> UsageError:
+    """Return the error for a plan that cannot be made."""
     subject = f"plan of {duration_s:g} s for cell {cell.name!r}"
     return kind(subject, found=found, expected=expected, remedy=remedy)
 
 
 _Way = tuple[tuple[float, ...], PlannedMove]
+"""Where a way starts, and the move that it makes."""
 
 
 def _way(pair: tuple[PlannedMove, PlannedMove]) -> _Way:
-    return pair[0].target_rad, pair[1]
+    """Return the way from the target of one move to that of the next."""
+    previous, move = pair
+    return previous.target_rad, move
 
 
 def plan(
@@ -624,7 +692,7 @@ def plan(
         else:
             largest_condition = LARGEST_CONDITION_OF_CHAIN
     goal = goal or PlanGoal.of_first(experiment.design)
-    room = _room(cell, duration_s, box)
+    targets = _targets(cell, duration_s, box)
     allowed = _allowed_targets(cell, box)
     if acceleration is None:
         acceleration = speed
@@ -636,7 +704,7 @@ def plan(
         acceleration,
         largest_condition,
         goal,
-        room,
+        targets,
         allowed,
     )
 
@@ -644,46 +712,71 @@ def plan(
         progress(done, float(np.max(std_percent)))
 
     draft = search.improve(search.random_moves(), exchanges, report_worst)
-    of_moves = np.sum(experiment.informations(draft.paths), axis=0)
-    information = goal.recorded + of_moves
+    # With all rows: the search compares by every second one.
+    information_of_moves = np.sum(experiment.informations(draft.paths), axis=0)
+    information = goal.recorded + information_of_moves
     predicted = experiment.design.std_percent(information)
-    found = experiment.design.condition(information)
-    worst = int(np.argmax(goal.ratio(predicted)))
-    if not found <= largest_condition:
-        condition = format_at_limit(found, largest_condition, 0)
-        words = (
-            f"condition {condition} of the weighted observation matrix after {exchanges} exchanges"
+    condition = experiment.design.condition(information)
+    # `not … <=`: a number that is NaN is refused as well.
+    if not condition <= largest_condition:
+        raise _badly_conditioned(
+            cell, experiment, duration_s, condition, largest_condition, exchanges
         )
-        ratio = found / largest_condition
-        remedy = _condition_remedy(experiment, duration_s, ratio)
-        kind = PlanTooShort if _is_mended_by_time(duration_s, ratio) else UsageError
-        raise _unfit(cell, duration_s, words, f"at most {largest_condition:.0f}", remedy, kind)
     used_s = experiment_duration_s(cell, draft.moves)
+    worst = int(np.argmax(goal.ratio(predicted)))
     if not predicted[worst] <= largest_std_percent:
-        percent = format_at_limit(float(predicted[worst]), largest_std_percent, 1)
-        words = f"{percent} % predicted for the gain of {cell.axes[worst].name}"
         excitation, _ = experiment.excitation(draft.paths)
         judged = verdicts(experiment.design, [(excitation, experiment.mounted)])
-        ways = ["allow more exchanges, wider joint limits or higher speed"]
-        kind = UsageError
+        std_percent = format_at_limit(float(predicted[worst]), largest_std_percent, 1)
+        longer_s = None
         if np.isfinite(predicted[worst]):
             excess = float(predicted[worst]) / largest_std_percent
             longer_s = longer_run_s(used_s, duration_s, excess)
-            if longer_s is not None:
-                ways.insert(0, f"allow a longer run (some --duration {longer_s:.0f})")
-                kind = PlanTooShort
-        sentences = ["; or ".join(ways), *judged.sentences(cell.axis_names)]
-        remedy = ". ".join(sentences)
-        raise _unfit(cell, duration_s, words, f"at most {largest_std_percent:g} %", remedy, kind)
+        kind = UsageError
+        remedy = "allow more exchanges, wider joint limits or higher speed"
+        if longer_s is not None:
+            kind = PlanTooShort
+            remedy = f"allow a longer run (some --duration {longer_s:.0f}); or {remedy}"
+        raise _unfit(
+            cell,
+            duration_s,
+            found=f"{std_percent} % predicted for the gain of {cell.axes[worst].name}",
+            expected=f"at most {largest_std_percent:g} %",
+            remedy=". ".join((remedy, *judged.sentences(cell.axis_names))),
+            kind=kind,
+        )
     return Plan(
         cell=cell.name,
         seed=seed,
-        condition=found,
+        condition=condition,
         predicted_std_percent=tuple(predicted.tolist()),
         duration_s=used_s,
         moves=draft.moves,
         units=tuple(axis.unit for axis in cell.axes),
         robot=calibrated_robot(cell),
+    )
+
+
+def _badly_conditioned(
+    cell: Cell,
+    experiment: Experiment,
+    duration_s: float,
+    condition: float,
+    largest: float,
+    exchanges: int,
+) -> UsageError:
+    """Return the error for a plan whose observation matrix is too badly conditioned."""
+    condition_text = format_at_limit(condition, largest, 0)
+    ratio = condition / largest
+    kind = PlanTooShort if _is_mended_by_time(duration_s, ratio) else UsageError
+    return _unfit(
+        cell,
+        duration_s,
+        found=f"condition {condition_text} of the weighted observation matrix after {exchanges} "
+        "exchanges",
+        expected=f"at most {largest:.0f}",
+        remedy=_condition_remedy(experiment, duration_s, ratio),
+        kind=kind,
     )
 
 
@@ -695,7 +788,7 @@ def _is_mended_by_time(duration_s: float, ratio: float) -> bool:
     """Whether a run of twice the duration may lower a condition that is too large by a ratio."""
     if ratio > MADE_BY_MORE_MOVES:
         return False
-    return _tens(2.0 * duration_s) <= LONGEST_S
+    return _up_to_tens(2.0 * duration_s) <= LONGEST_S
 
 
 def _condition_remedy(experiment: Experiment, duration_s: float, ratio: float) -> str:
@@ -704,13 +797,13 @@ def _condition_remedy(experiment: Experiment, duration_s: float, ratio: float) -
     """
     other = "more exchanges, wider joint limits or higher speed; `--condition` accepts more"
     if _is_mended_by_time(duration_s, ratio):
-        longer_s = _tens(2.0 * duration_s)
+        longer_s = _up_to_tens(2.0 * duration_s)
         return f"allow a longer run (some --duration {longer_s:.0f}), {other}"
-    turned = nearly_right_joints(experiment.design.expectation.model.robot)
-    if not turned:
+    joints = nearly_right_joints(experiment.design.expectation.model.robot)
+    if not joints:
         return f"allow {other}"
     exact = "1.5707963267948966 for a quarter turn, 3.141592653589793 for a half"
-    listed = ", ".join(turned)
+    listed = ", ".join(joints)
     return (
         f"the URDF turns {listed} by nearly a right angle, as rounded numbers do "
         f"(1.5708): parameters that an exact angle hides are nearly invisible then. Write {exact}. "
@@ -726,33 +819,38 @@ EXACTLY_RIGHT = 1e-9  #: Difference that a double leaves
 
 
 def nearly_right_joints(robot: Robot) -> tuple[str, ...]:
-    """Names of the joints that the URDF turns by nearly, but not exactly, right angles;
+    """Return the names of the joints that the URDF turns by nearly, but not exactly, right angles;
     axes are looked at, too.
     """
     found = []
     for joint in robot.joints:
         entries = np.concatenate((joint.rotation.ravel(), joint.axis))
         # Rotations by right angles have entries of 0, 1 and -1 alone.
-        off = np.abs(entries - np.round(entries))
-        if EXACTLY_RIGHT < off.max() < NEARLY_RIGHT:
+        largest_difference = np.abs(entries - np.round(entries)).max()
+        if EXACTLY_RIGHT < largest_difference < NEARLY_RIGHT:
             found.append(joint.name)
     return tuple(found)
 
 
-def _room(cell: Cell, duration_s: float, box: TargetBox | None) -> TargetBox:
-    """Return the least and the largest targets: those of the joint limits, and inside a box."""
+def _targets(cell: Cell, duration_s: float, box: TargetBox | None) -> TargetBox:
+    """Return between which positions targets are drawn: those of the joint limits, and inside a
+    box.
+
+    Raises:
+        UsageError: the box is outside the limits.
+    """
     lower, upper = limits_of(cell).targets()
     if box is None:
         return TargetBox(lower, upper)
-    room = TargetBox(np.maximum(lower, box.lower), np.minimum(upper, box.upper))
-    outside = list(compress(cell.axis_names, room.lower > room.upper))
+    targets = TargetBox(np.maximum(lower, box.lower), np.minimum(upper, box.upper))
+    outside = list(compress(cell.axis_names, targets.lower > targets.upper))
     if outside:
         listed = ", ".join(outside)
         found = f"a box of targets outside the joint limits of {listed}"
         raise _unfit(
             cell, duration_s, found, "a box inside the limits", "give a box that they allow"
         )
-    return room
+    return targets
 
 
 def _allowed_targets(cell: Cell, box: TargetBox | None) -> TargetBox:
@@ -770,20 +868,20 @@ def _allowed_targets(cell: Cell, box: TargetBox | None) -> TargetBox:
 
 
 def slowed(cell: Cell, plan_: Plan, override: float) -> Plan:
-    """The same ways at a share of their speed, as for a first run;
+    """Return the same ways at a share of their speed, as for a first run;
     the predictions are those of the plan as made.
     """
-    moves = tuple(
-        replace(
-            move, velocity=move.velocity * override, acceleration=move.acceleration * override**2
-        )
-        for move in plan_.moves
-    )
-    return replace(plan_, duration_s=experiment_duration_s(cell, moves), moves=moves)
+    moves = []
+    for move in plan_.moves:
+        velocity = move.velocity * override
+        acceleration = move.acceleration * override**2
+        moves.append(replace(move, velocity=velocity, acceleration=acceleration))
+    duration_s = experiment_duration_s(cell, moves)
+    return replace(plan_, duration_s=duration_s, moves=tuple(moves))
 
 
 def _slower(move: PlannedMove, share: float) -> PlannedMove:
-    """The same way at a share of its speed, as the plan file will say it,
+    """Return the same way at a share of its speed, as the plan file will say it,
     and no slower than one may say.
     """
     velocity = round(move.velocity * share, PLACES)
@@ -807,6 +905,8 @@ Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 
 
 class _Move(StrictModel):
+    """A move in a plan file."""
+
     target_deg: tuple[float, ...] | None = None
     target: tuple[float, ...] | None = None
     velocity: Velocity
@@ -834,6 +934,8 @@ class _Drive(StrictModel):
 
 
 class _Robot(StrictModel):
+    """The robot in a plan file."""
+
     kinematics_sha256: Digest
     drives_sha256: Digest
     # Plans of earlier versions have the digests alone.
@@ -849,14 +951,17 @@ class _Robot(StrictModel):
             joints.append(CalibratedJoint(joint.name, joint.kind, joint.parent))
         drives = []
         for drive in self.drives:
-            ids = (drive.node_id, drive.vendor_id, drive.product_code)
-            drives.append(CalibratedDrive(drive.axis, *ids))
+            drives.append(
+                CalibratedDrive(drive.axis, drive.node_id, drive.vendor_id, drive.product_code)
+            )
         return CalibratedRobot(
             self.kinematics_sha256, self.drives_sha256, tuple(joints), tuple(drives), self.motors
         )
 
 
 class _Plan(StrictModel):
+    """The content of a plan file."""
+
     document_kind: ClassVar[DocumentKind | None] = DocumentKind.PLAN
 
     format: Literal["drivegain-plan"]
@@ -896,11 +1001,11 @@ def save_plan(plan: Plan, path: Path) -> None:
     Raises:
         OSError: from the file system.
     """
-    key = _key(plan.units)
+    target_key = _target_key(plan.units)
     predicted = ", ".join(f"{value:.3f}" for value in plan.predicted_std_percent)
-    recorded = "moves made without load and with the payload"
+    predicted_for = "moves made without load and with the payload"
     if plan.purpose:
-        recorded = "all blocks of the session and these moves together"
+        predicted_for = "all blocks of the session and these moves together"
     units = ", ".join(unit.name for unit in plan.units)
     lines = [
         "# Synchronised point-to-point moves; velocity and acceleration are shares of the "
@@ -910,7 +1015,7 @@ def save_plan(plan: Plan, path: Path) -> None:
         f"cell: {plan.cell}",
         f"seed: {plan.seed}",
         f"condition: {plan.condition:.1f}    # of the weighted observation matrix",
-        f"predicted_std_percent: [{predicted}]    # of each gain, {recorded}",
+        f"predicted_std_percent: [{predicted}]    # of each gain, {predicted_for}",
     ]
     if plan.purpose:
         lines.append(f"purpose: {json.dumps(plan.purpose)}")  # a string of JSON is one of YAML
@@ -923,7 +1028,7 @@ def save_plan(plan: Plan, path: Path) -> None:
             positions.append(f"{position / unit.si:.3f}")
         target = ", ".join(positions)
         fields = [
-            f"{key}: [{target}]",
+            f"{target_key}: [{target}]",
             f"velocity: {move.velocity:.3f}",
             f"acceleration: {move.acceleration:.4f}",
             f"dwell_s: {move.dwell_s:.3f}",
@@ -934,6 +1039,7 @@ def save_plan(plan: Plan, path: Path) -> None:
 
 
 def _robot_lines(robot: CalibratedRobot) -> list[str]:
+    """Return the lines of a plan file that say which robot it is for."""
     lines = [
         "robot:    # a plan is for one robot",
         f"  kinematics_sha256: {robot.kinematics_sha256}",
@@ -974,7 +1080,9 @@ def load_plan(path: Path, cell: Cell) -> Plan:
         remedy = "make the plan anew: `drivegain plan CELL`"
         expected = f"{len(cell.axes)}, one a gain"
         raise _refused(f"{path}: predicted_std_percent", found, expected, remedy)
-    moves = tuple(_move(path, cell, number, move) for number, move in enumerate(model.moves))
+    moves = tuple(
+        _planned_move(path, cell, number, move) for number, move in enumerate(model.moves)
+    )
     duration_s = experiment_duration_s(cell, moves)
     if duration_s > LONGEST_S:
         found = f"{duration_s:.0f} s of moves and dwells"
@@ -1014,7 +1122,8 @@ def _robot_of(path: Path, stated: _Robot | None, cell: Cell) -> CalibratedRobot 
     return found
 
 
-def _key(units: tuple[JointUnit, ...]) -> str:
+def _target_key(units: tuple[JointUnit, ...]) -> str:
+    """Return the key of a target in a plan file: `target_deg` if every joint is in degrees."""
     if all(unit == DEGREE for unit in units):
         return "target_deg"
     return "target"
@@ -1023,14 +1132,27 @@ def _key(units: tuple[JointUnit, ...]) -> str:
 def _refused(
     where: str, found: str, expected: str, remedy: str = "correct the move"
 ) -> ConfigurationInconsistent:
+    """Return the error for a plan file that does not fit its cell."""
     return ConfigurationInconsistent(where, found=found, expected=expected, remedy=remedy)
 
 
-def _move(path: Path, cell: Cell, number: int, move: _Move) -> PlannedMove:
+def _planned_move(path: Path, cell: Cell, number: int, move: _Move) -> PlannedMove:
+    """Convert a move of a plan file to SI.
+
+    Args:
+        path: the file, for messages.
+        cell: with the units and the limits of the joints.
+        number: of the move in the file, from 0.
+        move: as the file has it.
+
+    Raises:
+        ConfigurationInconsistent: the target has another unit, other joints, or is outside the
+            limits.
+    """
     key = "target_deg" if move.target is None else "target"
     values = move.target_deg or move.target or ()
     where = f"{path}: moves[{number}].{key}"
-    expected_key = _key(tuple(axis.unit for axis in cell.axes))
+    expected_key = _target_key(tuple(axis.unit for axis in cell.axes))
     if key != expected_key:
         units = ", ".join(f"{axis.name} {axis.unit.name}" for axis in cell.axes)
         raise _refused(where, key, f"{expected_key} ({units})")
@@ -1078,28 +1200,34 @@ def way_to_first_target(
     blocked = checker.obstruction(start_rad, target)
     if blocked is None:
         return (first,), ""
-    positions = np.array([start_rad, *(move.target_rad for move in plan.moves)])
-    lower = positions.min(axis=0)
-    upper = positions.max(axis=0)
-    turns = clear_way(checker, start_rad, target, lower, upper, np.random.default_rng(0))
-    if turns is None:
+    positions = [start_rad]
+    for move in plan.moves:
+        positions.append(np.array(move.target_rad))
+    lower = np.min(positions, axis=0)
+    upper = np.max(positions, axis=0)
+    positions_between = clear_way(
+        checker, start_rad, target, lower, upper, np.random.default_rng(0)
+    )
+    if positions_between is None:
         raise MotionRefused(
-            f"the way from here to the first target of the plan: found {_spell(cell, blocked)}, "
+            f"the way from here to the first target of the plan: found {_describe(cell, blocked)}, "
             "and no other clear way between the positions of the plan; bring the robot near the "
             f"first target by hand, or correct {_keys(blocked)} in the cell file"
         )
     velocity = min(first.velocity, AROUND_SHARE)
     acceleration = min(first.acceleration, AROUND_SHARE)
-    slow = replace(first, velocity=velocity, acceleration=acceleration)
+    slow_to_first = replace(first, velocity=velocity, acceleration=acceleration)
     moves = []
-    for turn in turns:
-        moves.append(replace(slow, target_rad=tuple(turn.tolist()), dwell_s=DWELL_S))
-    positions_between = counted(len(turns), "further position")
+    for position in positions_between:
+        target_rad = tuple(position.tolist())
+        moves.append(replace(slow_to_first, target_rad=target_rad, dwell_s=DWELL_S))
+    moves.append(slow_to_first)
+    further = counted(len(positions_between), "further position")
     remark = (
         f"the straight way from where the robot stood to the first target of the plan is not clear "
-        f"({_spell(cell, blocked)}): slow moves led around it, by {positions_between}"
+        f"({_describe(cell, blocked)}): slow moves led around it, by {further}"
     )
-    return (*moves, slow), remark
+    return tuple(moves), remark
 
 
 def check_return(cell: Cell, start_rad: FloatArray, end_rad: FloatArray) -> None:
@@ -1113,7 +1241,7 @@ def check_return(cell: Cell, start_rad: FloatArray, end_rad: FloatArray) -> None
     found = _checker(cell).obstruction(start_rad, end_rad)
     if found is not None:
         raise MotionRefused(
-            f"the slow return within the limits: found {_spell(cell, found)}; bring the robot "
+            f"the slow return within the limits: found {_describe(cell, found)}; bring the robot "
             f"within its limits by hand, or correct {_keys(found)} in the cell file"
         )
 
@@ -1123,7 +1251,8 @@ def _is_bounded(cell: Cell) -> bool:
     return cell.clearance is not None or cell.chain is not None
 
 
-def _spell(cell: Cell, found: Obstruction) -> str:
+def _describe(cell: Cell, found: Obstruction) -> str:
+    """Say what is in the way, and where the joints are then."""
     positions = []
     for axis, position in zip(cell.axes, found.position, strict=True):
         positions.append(axis.unit.spell(position))
@@ -1135,13 +1264,14 @@ def _spell(cell: Cell, found: Obstruction) -> str:
 
 
 def _keys(found: Obstruction) -> str:
+    """Return the keys of the cell file that say what is in the way."""
     if found.first == CLOSURES:
         return "`closures`, `motors` and `limits`"
     return "`workspace` and `clearance`"
 
 
 def _checker(cell: Cell) -> Checker:
-    """Distances to what the cell file declares;
+    """Return the distances to what the cell file declares;
     that a guessed arm touches itself refuses nothing.
     """
     robot = model_of(cell).robot
@@ -1167,7 +1297,7 @@ def _check_room(path: Path, cell: Cell, moves: tuple[PlannedMove, ...]) -> None:
                 expected = f"at least {1000 * minimum_m:.0f} mm"
             raise _refused(
                 f"{path}: moves[{number}], on the way there",
-                _spell(cell, found),
+                _describe(cell, found),
                 expected,
                 f"correct the move, or {_keys(found)} in the cell file",
             )

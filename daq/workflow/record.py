@@ -48,6 +48,7 @@ from daq.workflow.safeguards import (
 )
 from drivers.canopen.bus import BusAddress
 from drivers.canopen.network import CanopenNetwork, SignalBlocker
+from drivers.canopen.scale import ScaleReading
 from drivers.errors import BusError, MotionRefused
 from drivers.messages import CellEvent, EventKind, Sample
 from drivers.motion.execute import execute
@@ -57,6 +58,7 @@ from drivers.stream.polling import Polling
 from drivers.stream.producers import DriveProducer, KernelProducer, SyncProducer
 from drivers.stream.stream import SyncStream
 from drivers.stream.sync import LockstepSync, Pacing, TimedSync
+from ident.arrays import FloatArray
 from ident.model.bodies import Payload
 
 #: Time for all answers to a SYNC; a simulated cell on a busy machine may be that late
@@ -79,7 +81,14 @@ the interface's counters are read five times a second (capture.py).
 LATEST_ANSWERS_S = 0.1  #: Time in which a cell has answered the last SYNC, even if it is late
 SPACE_CHECK_S = 0.1  #: Recorded time between two checks of the free space on the disk
 SLOW_DISK_S = 1.0  #: Longest time for which a part of the log may wait for the disk unremarked
-ROUNDING = 1.001  #: Factor by which rounding to whole counts may exceed a limit
+ROUNDING = 1.001
+"""Factor by which a motor's limits are above the joints':
+drives take whole counts only, and a move at the limit is rounded up.
+"""
+LEAST_PER_S = 3.0
+"""Least limits of velocity and acceleration with which `synchronised_move` can plan
+[counts/s, counts/s²].
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,14 +157,13 @@ class RecordingRequest:
     operator: str  #: person or job responsible for the recording
     granted_by: str | None  #: operator who permits the motion; None refuses it
     run_id: str  #: identity of the run in its log
-    speed: float = (
-        #: share of the planned speed at which the moves are made (`daq.workflow.plan.slowed`), for
-        #: the log
-        1.0
-    )
+    #: share of the planned speed at which the moves are made, for the log; the plan is slowed down
+    #: already (`daq.workflow.plan.slowed`)
+    speed: float = 1.0
     #: mass of the payload that was weighed for this recording [kg]; None if it was not
     entered_kg: float | None = None
-    unguarded: bool = False  #: whether axes may move that go on moving when this program is killed
+    #: whether an axis may move that no drive stops when this program is killed
+    unguarded: bool = False
 
 
 def record(
@@ -200,7 +208,6 @@ def record(
     """
     clocks = clocks or Clocks()
     cell = request.cell
-    out = request.out
     granted_by = _permission(request.granted_by)
     check_entered_mass(cell, request.payload, request.entered_kg)
     require_released = require_released or release_check(cell, clocks.now)
@@ -208,80 +215,106 @@ def record(
     with (
         on_time(),
         network_of(cell, block_signals) as network,
-        _sync_producer(cell, network) as wanted,
+        _sync_producer(cell, network) as declared_producer,
     ):
         network.prepare()
         _require_guarded(network, request.unguarded)
         polling = Polling.found(network, beside_stream=polling_fits(cell))
-        scales = network.scales()
-        check_nameplates(request.cell_file, cell, scales)
-        warnings = [*load_warnings(cell), *nameplate_warnings(cell, scales), *network.unguarded()]
-        warnings += polling_warnings(cell) if polling else ()
+        drive_scales = network.scales()
+        check_nameplates(request.cell_file, cell, drive_scales)
+        cell_warnings = _cell_warnings(cell, network, drive_scales, polling)
         readback = readback_of_drives(
             cell.axis_names, network.ampere_per_unit(), network.readback()
         )
         scale = scaling(cell, readback)
         rate_hz = 1e6 / _sync(cell).period_us
         files = bundle(request.cell_file)
-        # Read the positions first, so that a refusal comes before a file exists. This takes a
-        # stream of its own: the checks below last many periods, and the schedule of the recording
-        # does not wait.
-        producer, remarks = _started(cell, wanted)
+        # Read the positions first, so that a refusal comes before a file exists. A stream of their
+        # own reads them: once the recording's stream runs, it must be read every period, and the
+        # checks below last many periods.
+        producer, sync_remarks = _start_producer(cell, declared_producer)
         permission = MotionPermission(granted_by, motor_limits(cell, scale))
-        pacing = partial(_pacing, cell, clocks.wall_ns(), clocks, producer)
-        start_counts, recovered = _start(cell, network, scale, permission, pacing, require_released)
-        _let_rest(producer, network)
-        moves, around = _checked_moves(cell, request.plan, scale, start_counts, permission)
-        room = DiskRoom(out, free)
+        pacing_before_run = partial(_pacing, cell, clocks.wall_ns(), clocks, producer)
+        start_counts, recovery_remarks = _start_within_limits(
+            cell, network, scale, permission, pacing_before_run, require_released
+        )
+        _pause_sync(producer, network)
+        moves, way_remarks = _checked_moves(cell, request.plan, scale, start_counts, permission)
+        room = DiskRoom(request.out, free)
         room.require(_log_bytes(cell, moves, start_counts, files))
         temperatures = polling.temperatures(clocks.wall_ns())
-        # Before the first SYNC of the recording's stream, whose schedule does not wait either.
+        # An interlock may be slow, too: ask it before the first SYNC of the recording's stream.
         require_released()
         run = _run_info(request, rate_hz, clocks)
         content = LogContent.of(cell, run, files, readback)
         with LogWriter(
-            out,
+            request.out,
             content,
             scale.joint_position_of,
             clocks.monotonic_ns,
             waits_for_disk=False,
         ) as log:
-            kept = LogAndFeed(
+            log_and_feed = LogAndFeed(
                 log,
                 feed or Feed(request.cell_file),
                 lambda done: progress(done, len(moves)),
                 RecordedMotion(len(cell.axes)),
             )
-            kept.feed.begin(_facts(cell, scale, run, out, len(moves)), lambda: log.statistics)
+            run_facts = _facts(cell, scale, run, request.out, len(moves))
+            log_and_feed.feed.begin(run_facts, lambda: log.statistics)
             log.readings(temperatures)
-            stream = SyncStream(
-                network, _pacing(cell, run.started_wall_ns, clocks, producer), kept.event
-            )
+            # The samples of this stream are stamped from the start that the log states.
+            pacing = _pacing(cell, run.started_wall_ns, clocks, producer)
+            stream = SyncStream(network, pacing, log_and_feed.event)
             polling.begin(stream, log.reading)
             for sample in until_complete(stream):
-                kept.sample(sample)
-            samples = execute(network, stream, moves, permission)
-            short = _keep_motion(samples, kept, room, max(1, round(SPACE_CHECK_S * rate_hz)))
+                log_and_feed.sample(sample)
+            motion = execute(network, stream, moves, permission)
+            check_every = max(1, round(SPACE_CHECK_S * rate_hz))
+            disk_full = _log_motion(motion, log_and_feed, room, check_every)
             stream.read_on(LATE_LOSSES_S)
             log.readings(polling.temperatures(stream.time_ns))
-            reason = (
-                _stopped(short, kept, len(moves))
+            invalid_because = (
+                _unfinished_reason(disk_full, log_and_feed.done, len(moves))
                 or stream_losses(stream.statistics)
-                or kept.motion.reason(cell, readback, rate_hz)
+                or log_and_feed.motion.reason(cell, readback, rate_hz)
             )
             log.conclude(
-                not reason, reason, wall_minus_monotonic_ns=clocks.wall_minus_monotonic_ns()
+                valid=not invalid_because,
+                reason=invalid_because,
+                wall_minus_monotonic_ns=clocks.wall_minus_monotonic_ns(),
             )
-        kept.feed.finish()
-        if short is not None:
-            raise short
-        warnings += (*_other_master(network), *remarks, *recovered, *around, *polling.remarks)
-        warnings += _slow_disk(out, log.longest_wait_s)
-        return Recorded(out, log.statistics, stream.statistics, tuple(warnings))
+        log_and_feed.feed.finish()
+        if disk_full is not None:
+            raise disk_full
+        warnings = (
+            *cell_warnings,
+            *_other_master(network),
+            *sync_remarks,
+            *recovery_remarks,
+            *way_remarks,
+            *polling.remarks,
+            *_slow_disk(request.out, log.longest_wait_s),
+        )
+        return Recorded(request.out, log.statistics, stream.statistics, warnings)
+
+
+def _cell_warnings(
+    cell: Cell, network: CanopenNetwork, scales: Sequence[ScaleReading], polling: Polling
+) -> tuple[str, ...]:
+    """Return what is known before a run that a person should mend, but that stops no recording."""
+    warnings = [
+        *load_warnings(cell),
+        *nameplate_warnings(cell, scales),
+        *network.unguarded(),
+    ]
+    if polling:
+        warnings += polling_warnings(cell)
+    return tuple(warnings)
 
 
 def _other_master(network: CanopenNetwork) -> tuple[str, ...]:
-    """Return who else spoke on the bus as a master does, if one did."""
+    """Return a warning of another program that spoke on the bus as a master; empty without."""
     other = network.other_master()
     if not other:
         return ()
@@ -289,7 +322,7 @@ def _other_master(network: CanopenNetwork) -> tuple[str, ...]:
 
 
 def _slow_disk(out: Path, longest_wait_s: float) -> tuple[str, ...]:
-    """Return what a disk that took long to take the log cost, if it did."""
+    """Return a warning of a disk on which a part of the log waited long; empty otherwise."""
     if longest_wait_s <= SLOW_DISK_S:
         return ()
     return (
@@ -299,7 +332,7 @@ def _slow_disk(out: Path, longest_wait_s: float) -> tuple[str, ...]:
 
 
 def _run_info(request: RecordingRequest, rate_hz: float, clocks: Clocks) -> RunInfo:
-    """Return what the log says of a run that starts now."""
+    """Return what the log says of a run; its start is the present time of the clocks."""
     started_ns = clocks.monotonic_ns()
     wall_ns = started_ns + clocks.wall_minus_monotonic_ns()
     digest = controller_digest(request.cell)
@@ -331,7 +364,7 @@ def controller_digest(cell: Cell) -> str | None:
 
 
 def _facts(cell: Cell, scale: SiScaling, run: RunInfo, out: Path, moves: int) -> RunFacts:
-    """Return what a console must know of a run."""
+    """Return what a console must know of a run to show its samples in SI."""
     bus_load = {bus.name: load.mean for bus, load in bus_loads(cell)}
     payload = None if run.payload is None else run.payload.name
     return RunFacts(
@@ -379,6 +412,12 @@ def keep_samples(
 ) -> None:
     """Log and publish every sample of a motion; end the motion when logging fails.
 
+    Args:
+        samples: those of `execute`.
+        kept: the log and the feed.
+        room: the space on the log's disk.
+        check_every: number of samples from one check of that space to the next.
+
     An error is thrown into `execute`, which stops the axes and attaches to the error what it could
     not confirm. If the generator were only closed, these notes would be lost.
 
@@ -391,19 +430,25 @@ def keep_samples(
             if number % check_every == 0:
                 room.check()
         except BaseException as error:
-            samples.throw(error)
+            samples.throw(error)  # `execute` raises it again, with its notes
             raise
 
 
-def _keep_motion(
-    samples: Generator[Sample, None, None], kept: LogAndFeed, room: DiskRoom, check_every: int
+def _log_motion(
+    samples: Generator[Sample, None, None],
+    log_and_feed: LogAndFeed,
+    room: DiskRoom,
+    check_every: int,
 ) -> DiskSpaceShort | None:
-    """Log a motion to its end; returns the error of a disk that became full,
-    after which the axes were stopped.
+    """Log a motion as `keep_samples` does, to its end or until the disk is full.
+
+    Returns:
+        The error of a full disk, after which the axes were stopped; None if the motion was
+        finished.
     """
     with closing(samples):
         try:
-            keep_samples(samples, kept, room, check_every)
+            keep_samples(samples, log_and_feed, room, check_every)
         except DiskSpaceShort as error:
             return error
     return None
@@ -439,17 +484,18 @@ def until_complete(stream: SyncStream) -> tuple[Sample, ...]:
     """
     samples = [next(stream)]
     while samples[-1].missing:
-        samples.append(next(stream))  # ends at the stream's limit of incomplete cycles
+        # The stream raises SampleLost after too many incomplete cycles.
+        samples.append(next(stream))
     return tuple(samples)
 
 
 def _positions(network: CanopenNetwork, pacing: Pacing) -> tuple[int, ...]:
     """Return the positions of the axes [counts]; PDOs and objects must agree."""
-    asking = SyncStream(network, pacing)
-    start = until_complete(asking)[-1]
-    asking.check()
-    network.check_feedback(start)
-    return start.position_counts
+    stream = SyncStream(network, pacing)
+    complete = until_complete(stream)[-1]
+    stream.check()
+    network.check_feedback(complete)
+    return complete.position_counts
 
 
 def motor_limits(cell: Cell, scale: SiScaling) -> tuple[AxisLimits, ...]:
@@ -458,25 +504,33 @@ def motor_limits(cell: Cell, scale: SiScaling) -> tuple[AxisLimits, ...]:
 
     A coupled motor turns with several joints: its range is the sum of theirs (eq. 24). The limits
     of the joints are checked in the plan.
+
+    Returns:
+        The limits by axis, in the order of the cell.
     """
     limits = limits_of(cell)
-    lower = limits.lower - scale.offset_rad
-    upper = limits.upper - scale.offset_rad
-    forwards = np.maximum(cell.ratio, 0.0)
-    backwards = np.minimum(cell.ratio, 0.0)
-    low = (forwards @ lower + backwards @ upper) / scale.rad_per_count
-    high = (forwards @ upper + backwards @ lower) / scale.rad_per_count
-    turns = np.abs(cell.ratio) * ROUNDING / scale.rad_per_count[:, None]
-    velocity = turns @ limits.velocity
-    acceleration = turns @ limits.acceleration
+    lower_rad = limits.lower - scale.offset_rad
+    upper_rad = limits.upper - scale.offset_rad
+    # A motor that turns against a joint is lowest where that joint is highest:
+    # low = R⁺ q_lower + R⁻ q_upper, with the positive and the negative part of R = R⁺ + R⁻.
+    positive_ratio = np.maximum(cell.ratio, 0.0)
+    negative_ratio = np.minimum(cell.ratio, 0.0)
+    low_rad = positive_ratio @ lower_rad + negative_ratio @ upper_rad
+    high_rad = positive_ratio @ upper_rad + negative_ratio @ lower_rad
+    low_counts = low_rad / scale.rad_per_count
+    high_counts = high_rad / scale.rad_per_count
+    # Counts of each motor a radian of each joint: |R| / (rad a count of the motor's row).
+    counts_per_joint_rad = np.abs(cell.ratio) * ROUNDING / scale.rad_per_count[:, None]
+    velocity_counts_s = counts_per_joint_rad @ limits.velocity
+    acceleration_counts_s2 = counts_per_joint_rad @ limits.acceleration
     motors = []
-    for motor in range(len(low)):
+    for motor in range(len(low_counts)):
         motors.append(
             AxisLimits(
-                position_min_counts=int(np.floor(low[motor])),
-                position_max_counts=int(np.ceil(high[motor])),
-                velocity_counts_s=float(velocity[motor]),
-                acceleration_counts_s2=float(acceleration[motor]),
+                position_min_counts=int(np.floor(low_counts[motor])),
+                position_max_counts=int(np.ceil(high_counts[motor])),
+                velocity_counts_s=float(velocity_counts_s[motor]),
+                acceleration_counts_s2=float(acceleration_counts_s2[motor]),
             )
         )
     return tuple(motors)
@@ -498,18 +552,37 @@ def motor_moves(
         motor_rad = cell.ratio @ (target_rad - scale.offset_rad)
         target_counts = np.rint(motor_rad / scale.rad_per_count)
         target = tuple(map(int, target_counts))
-        speed = np.abs(cell.ratio @ path.velocity / scale.rad_per_count)
-        ramp = np.abs(cell.ratio @ path.acceleration / scale.rad_per_count)
-        # Limits for this move alone: the fastest trapezoid within them is that of the joints.
-        exact = [
-            AxisLimits(0, 0, max(v, 2.0) + 1.0, max(a, 2.0) + 1.0)
-            for v, a in zip(speed, ramp, strict=True)
-        ]
-        dwell = round(planned.dwell_s * 1e6 / _sync(cell).period_us)
-        moves.append(synchronised_move(here, target, exact, dwell))
+        motor_velocity = np.abs(cell.ratio @ path.velocity / scale.rad_per_count)
+        motor_acceleration = np.abs(cell.ratio @ path.acceleration / scale.rad_per_count)
+        move_limits = _limits_of_move(motor_velocity, motor_acceleration)
+        dwell_cycles = round(planned.dwell_s * 1e6 / _sync(cell).period_us)
+        moves.append(synchronised_move(here, target, move_limits, dwell_cycles))
         here_rad = target_rad
         here = target
     return tuple(moves)
+
+
+def _limits_of_move(velocity: FloatArray, acceleration: FloatArray) -> list[AxisLimits]:
+    """Return limits within which the fastest trapezoid of the motors is that of the joints.
+
+    `synchronised_move` stays one count below its limits, so that it can round up, and needs some
+    velocity of a motor that stands still.
+
+    Args:
+        velocity: largest velocity of each motor in this move [counts/s], shape (n,).
+        acceleration: its acceleration [counts/s²], shape (n,).
+    """
+    limits = []
+    for motor_velocity, motor_acceleration in zip(velocity, acceleration, strict=True):
+        limits.append(
+            AxisLimits(
+                position_min_counts=0,
+                position_max_counts=0,
+                velocity_counts_s=max(motor_velocity + 1.0, LEAST_PER_S),
+                acceleration_counts_s2=max(motor_acceleration + 1.0, LEAST_PER_S),
+            )
+        )
+    return limits
 
 
 def _permission(granted_by: str | None) -> str:
@@ -551,12 +624,15 @@ def _require_guarded(network: CanopenNetwork, unguarded: bool) -> None:
 # begins there. A cell file with `policy: {recovery_motion: allowed}` permits a slow return by a
 # little; it needs the same permission to move, and the same interlock, as every motion.
 
-LARGEST_SHARE = 0.02  #: Of an axis's range: farther beyond a limit a person has to find out why
+LARGEST_SHARE = 0.02
+"""Share of an axis's range by which it may be beyond a limit and still be brought back;
+farther out, a person has to find out why.
+"""
 RECOVERY_SPEED = 0.05  #: Share of an axis's limits of velocity and acceleration
-#: Share of the range by which the return ends within the limit: a loop at rest is off by some
-#: counts
 INSIDE = 0.001
-LEAST_PER_S = 3.0  #: Least velocity and acceleration of a move [counts/s, counts/s²]
+"""Share of an axis's range by which the return ends within the limit:
+a position controller at rest is off by some counts.
+"""
 
 
 def _recovery_limits(start_counts: int, limit: AxisLimits) -> AxisLimits:
@@ -587,8 +663,10 @@ def recovery_move(
     for name, start, limit in zip(cell.axis_names, start_counts, limits, strict=True):
         low = limit.position_min_counts
         high = limit.position_max_counts
-        beyond = max(low - start, start - high, 0)
-        if not beyond:
+        below = low - start
+        above = start - high
+        beyond = max(below, above)
+        if beyond <= 0:
             target.append(start)
             continue
         share = beyond / max(high - low, 1)
@@ -597,21 +675,19 @@ def recovery_move(
         outside.append(
             f"{name} at {start} counts, {beyond} ({percent:.2g} % of its range) beyond its limits"
         )
-        inside = INSIDE * (high - low)
-        target.append(round(np.clip(start, low + inside, high - inside)))
+        margin = INSIDE * (high - low)
+        nearest_inside = np.clip(start, low + margin, high - margin)
+        target.append(round(nearest_inside))
     if not outside:
         return None
     found = "; ".join(outside)
-    _require_allowed(cell, found, largest_share)
-    here = scale.joint_position(np.array(start_counts))
-    there = scale.joint_position(np.array(target))
-    check_return(cell, here, there)
-    slow = tuple(map(_recovery_limits, start_counts, limits))
-    return (
-        synchronised_move(start_counts, tuple(target), slow),
-        slow,
-        (f"{found}; it was brought back slowly"),
-    )
+    _require_recovery_allowed(cell, found, largest_share)
+    start_rad = scale.joint_position(np.array(start_counts))
+    target_rad = scale.joint_position(np.array(target))
+    check_return(cell, start_rad, target_rad)
+    slow_limits = tuple(map(_recovery_limits, start_counts, limits))
+    move = synchronised_move(start_counts, tuple(target), slow_limits)
+    return move, slow_limits, f"{found}; it was brought back slowly"
 
 
 def bring_back(
@@ -627,15 +703,24 @@ def bring_back(
         DriverError: as `execute`; the axes were stopped.
     """
     stream = SyncStream(network, pacing)
-    with closing(
-        execute(network, stream, (move,), MotionPermission(granted_by, limits))
-    ) as samples:
+    permission = MotionPermission(granted_by, limits)
+    with closing(execute(network, stream, (move,), permission)) as samples:
         for _ in samples:
             pass
     network.prepare()  # a motion ends the guards
 
 
-def _require_allowed(cell: Cell, found: str, share: float) -> None:
+def _require_recovery_allowed(cell: Cell, found: str, share: float) -> None:
+    """Refuse a return that the cell does not allow, or that is too long.
+
+    Args:
+        cell: the cell with its policy.
+        found: the axes beyond their limits, for the message.
+        share: how far the farthest of them is beyond, as a share of its range.
+
+    Raises:
+        MotionRefused: with what to do instead.
+    """
     by_hand = "nothing has moved; bring it back by hand"
     if cell.chain is not None:
         remedy = f"{by_hand}: no motor of a closed chain moves alone"
@@ -651,12 +736,12 @@ def _require_allowed(cell: Cell, found: str, share: float) -> None:
     raise MotionRefused(found, expected="every axis within its limits", remedy=remedy)
 
 
-def _start(
+def _start_within_limits(
     cell: Cell,
     network: CanopenNetwork,
     scale: SiScaling,
     permission: MotionPermission,
-    pacing: Callable[[], Pacing],
+    make_pacing: Callable[[], Pacing],
     require_released: Callable[[], None],
 ) -> tuple[tuple[int, ...], tuple[str, ...]]:
     """Return the positions of the axes [counts], brought back within their limits if need be,
@@ -666,14 +751,15 @@ def _start(
         MotionRefused: an axis is outside its limits, and may not be brought back.
         DriverError: as `execute`.
     """
-    start_counts = _positions(network, pacing())
-    way = recovery_move(cell, scale, start_counts, permission.limits)
-    if way is None:
+    start_counts = _positions(network, make_pacing())
+    recovery = recovery_move(cell, scale, start_counts, permission.limits)
+    if recovery is None:
         return start_counts, ()
     require_released()
-    move, slow, remark = way
-    bring_back(network, pacing(), move, slow, permission.granted_by)
-    return _positions(network, pacing()), (remark,)
+    move, slow_limits, remark = recovery
+    bring_back(network, make_pacing(), move, slow_limits, permission.granted_by)
+    recovered_counts = _positions(network, make_pacing())
+    return recovered_counts, (remark,)
 
 
 def _checked_moves(
@@ -689,18 +775,21 @@ def _checked_moves(
     Raises:
         MotionRefused: they do not keep the limits, or no way to the first target is clear.
     """
-    to_first, remark = way_to_first_target(cell, plan, scale.joint_position(np.array(start_counts)))
-    whole = replace(plan, moves=(*to_first, *plan.moves[1:]))
-    moves = motor_moves(cell, whole, scale, start_counts)
+    start_rad = scale.joint_position(np.array(start_counts))
+    moves_to_first, remark = way_to_first_target(cell, plan, start_rad)
+    # They replace the plan's first move: its target is the last of theirs.
+    plan_from_start = replace(plan, moves=(*moves_to_first, *plan.moves[1:]))
+    moves = motor_moves(cell, plan_from_start, scale, start_counts)
     check_moves(start_counts, moves, permission, cell.axis_names)
-    return moves, (remark,) if remark else ()
+    remarks = (remark,) if remark else ()
+    return moves, remarks
 
 
-def _stopped(short: DiskSpaceShort | None, kept: LogAndFeed, moves: int) -> str:
+def _unfinished_reason(disk_full: DiskSpaceShort | None, done: int, moves: int) -> str:
     """Return why the moves were not finished; empty where they were."""
-    if short is None:
+    if disk_full is None:
         return ""
-    return f"stopped after {kept.done} of {moves} moves: {short.found}"
+    return f"stopped after {done} of {moves} moves: {disk_full.found}"
 
 
 def stream_losses(statistics: StreamStatistics) -> str:
@@ -723,6 +812,11 @@ def stream_losses(statistics: StreamStatistics) -> str:
 
 
 def _sync(cell: Cell) -> declared.Sync:
+    """Return the SYNC that the cell file declares.
+
+    Raises:
+        ConfigurationInconsistent: it declares none.
+    """
     if cell.sync is None:
         raise ConfigurationInconsistent(
             f"cell {cell.name!r}",
@@ -744,21 +838,28 @@ def _sync_producer(
     address = network.link.address
     if sync is None:
         return nullcontext()
-    timed = sync.pacing is declared.PacingMode.TIMED
-    by_kernel = isinstance(address, BusAddress) and address.kind.has_kernel_sync
-    is_kernel_better = sync.producer == declared.RECORDER and timed and by_kernel
-    if sync.producer == declared.KERNEL or is_kernel_better:
+    if sync.producer == declared.KERNEL:
         return KernelProducer(network, sync.period_us)
     if sync.producer == declared.RECORDER:
+        is_timed = sync.pacing is declared.PacingMode.TIMED
+        kernel_can = isinstance(address, BusAddress) and address.kind.has_kernel_sync
+        if is_timed and kernel_can:
+            return KernelProducer(network, sync.period_us)
         return nullcontext()
     return DriveProducer(network, cell.axis_names.index(sync.producer), sync.period_us)
 
 
-def _started(
+def _start_producer(
     cell: Cell, producer: SyncProducer | None
 ) -> tuple[SyncProducer | None, tuple[str, ...]]:
-    """Start the SYNC producer; returns it, or None with a remark if this program has to send SYNC
-    after all.
+    """Start the SYNC producer, if there is one.
+
+    Returns:
+        The producer, None if this program sends SYNC; and a remark if it does so because the
+        kernel cannot.
+
+    Raises:
+        BusError: the producer that the cell file names cannot send SYNC.
     """
     try:
         if producer is not None:
@@ -766,13 +867,12 @@ def _started(
     except BusError as error:
         if _sync(cell).producer != declared.RECORDER:
             raise
-        return None, (
-            f"SYNC is sent by this program, and late when the computer is busy: {error.reason}",
-        )
+        remark = f"SYNC is sent by this program, and late when the computer is busy: {error.reason}"
+        return None, (remark,)
     return producer, ()
 
 
-def _let_rest(producer: SyncProducer | None, network: CanopenNetwork) -> None:
+def _pause_sync(producer: SyncProducer | None, network: CanopenNetwork) -> None:
     """Stop SYNC until the recording's stream, and wait for the last answers.
 
     The stream starts SYNC again, at any time after the last one. Answers to that one must not come
@@ -784,11 +884,20 @@ def _let_rest(producer: SyncProducer | None, network: CanopenNetwork) -> None:
 
 
 def _pacing(cell: Cell, start_ns: int, clocks: Clocks, producer: SyncProducer | None) -> Pacing:
+    """Return the pacing of one stream, with the producer started.
+
+    Args:
+        cell: the cell, with its SYNC.
+        start_ns: time stamp of the stream's first period.
+        clocks: the clocks of the recording.
+        producer: the producer of SYNC; None if this program sends it.
+    """
     sync = _sync(cell)
     period_ns = sync.period_us * 1000
     clock = clocks.monotonic_ns
     if producer is not None:
-        producer.start()  # again: it may have ended while nothing was recorded
+        # It may have ended since its first start, while no stream was read.
+        producer.start()
         silence_s = max(SYNC_SILENCE_S, SYNC_SILENCE_PERIODS * period_ns * 1e-9)
         return producer.pacing(silence_s, start_ns, clock)
     if sync.pacing is declared.PacingMode.LOCKSTEP:

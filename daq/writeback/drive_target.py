@@ -103,7 +103,9 @@ def record_folder(cell: Cell) -> Path:
             remedy="use the cell file, not the copy in a log",
         )
     store = cell.history.store
-    return store.with_name(store.name.removesuffix(".sqlite").removesuffix(".history") + ".drives")
+    # `demo.history.sqlite` and `demo.sqlite` both give `demo.drives`.
+    stem = store.name.removesuffix(".sqlite").removesuffix(".history")
+    return store.with_name(f"{stem}.drives")
 
 
 def write_record(
@@ -111,11 +113,15 @@ def write_record(
 ) -> Path:
     """Put a record on the disk, later in order than every other.
 
+    Returns:
+        Its path.
+
     Raises:
         OSError: from the file system.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    path = folder / f"{next_order(list(_records(folder)), now)}.json"
+    taken = list(_records(folder))
+    path = folder / f"{next_order(taken, now)}.json"
     record = DriveRecord(
         format="drivegain drive record 1",
         cell=cell,
@@ -124,8 +130,9 @@ def write_record(
         drives=drives,
         sha256="",
     )
-    body = {**_body(record), "sha256": _digest(record)}
-    replace_file(path, (json.dumps(body, indent=1, ensure_ascii=False) + "\n").encode())
+    content = {**_content_without_digest(record), "sha256": _digest(record)}
+    text = json.dumps(content, indent=1, ensure_ascii=False) + "\n"
+    replace_file(path, text.encode())
     return path
 
 
@@ -136,12 +143,16 @@ def read_records(folder: Path) -> tuple[Path, ...]:
 
 def _records(folder: Path) -> dict[tuple[str, int], Path]:
     """Return the records of a folder by time and count in their names, in that order."""
-    found: dict[tuple[str, int], Path] = {}
-    for path in folder.iterdir() if folder.is_dir() else ():
+    if not folder.is_dir():
+        return {}
+    records: dict[tuple[str, int], Path] = {}
+    for path in folder.iterdir():
         match = _NAME.fullmatch(path.name)
         if match is not None:
-            found[match[1], int(match[2] or 0)] = path
-    return dict(sorted(found.items()))
+            time = match[1]
+            count = int(match[2] or 0)
+            records[(time, count)] = path
+    return dict(sorted(records.items()))
 
 
 def read_record(path: Path) -> DriveRecord:
@@ -153,24 +164,30 @@ def read_record(path: Path) -> DriveRecord:
     try:
         record = DriveRecord.model_validate_json(read_regular(path, _MAX_BYTES))
     except (OSError, ValueError) as error:
-        raise _unfit(path, str(error).splitlines()[0][:200]) from error
-    if record.sha256 != _digest(record):
+        first_line = str(error).splitlines()[0]
+        raise _unfit(path, first_line[:200]) from error
+    digest = _digest(record)
+    if record.sha256 != digest:
         raise _unfit(
             path,
-            f"content with SHA-256 {_digest(record)[:12]}…, not {record.sha256[:12]}… as it says",
+            f"content with SHA-256 {digest[:12]}…, not {record.sha256[:12]}… as it says",
         )
     return record
 
 
-def _body(record: DriveRecord) -> dict[str, object]:
+def _content_without_digest(record: DriveRecord) -> dict[str, object]:
+    """Return what the digest of a record is taken of, as plain JSON."""
     return record.model_dump(mode="json", exclude={"sha256"})
 
 
 def _digest(record: DriveRecord) -> str:
-    return sha256(json.dumps(_body(record), sort_keys=True).encode())
+    """Return the SHA-256 of a record without its own, whatever the order of the keys."""
+    text = json.dumps(_content_without_digest(record), sort_keys=True)
+    return sha256(text.encode())
 
 
 def _unfit(path: Path, found: str) -> ControllerUnfit:
+    """Return the error for a file that is no record, or was changed."""
     return ControllerUnfit(
         str(path),
         found=found,
@@ -179,7 +196,7 @@ def _unfit(path: Path, found: str) -> ControllerUnfit:
     )
 
 
-_REVIEW = "take a dry run, review it, and repeat it with the --base that it prints"
+_REVIEW_REMEDY = "take a dry run, review it, and repeat it with the --base that it prints"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -200,16 +217,15 @@ class DriveEdit(Edit):
     @property
     def diff(self) -> str:
         """A line for each drive: its object, its value now, and the one to be written."""
-        lines = [
-            f"{change.key}: {value.value:.9g} -> {change.spelling}\n"
-            for change, value in zip(self.changes, self.values, strict=True)
-        ]
+        lines = []
+        for change, current in zip(self.changes, self.values, strict=True):
+            lines.append(f"{change.key}: {current.value:.9g} -> {change.spelling}\n")
         return "".join(lines)
 
     @property
     def has_effect(self) -> bool:
-        """Always: drives that have these gains in RAM are made to save them,
-        and lose what they had saved.
+        """Always true: drives that have these gains in RAM already are made to save them,
+        in the place of what they had saved.
         """
         return True
 
@@ -252,25 +268,26 @@ class DriveTarget:
             )
         require_axes(calibration, self.cell.axis_names)
         gains = {gain.axis: gain for gain in calibration.gains}
-        pairs = [
-            (axis, one.parameter) for axis, one in zip(self.network.axes, objects, strict=True)
-        ]
-        base = read_parameters(self.network, pairs)
-        planned = [
-            _change(gains[value.axis.name], value, one)
-            for value, one in zip(base, objects, strict=True)
-        ]
-        writes = tuple(write for _, write in planned)
+        parameters = [gain_object.parameter for gain_object in objects]
+        current = read_parameters(
+            self.network, list(zip(self.network.axes, parameters, strict=True))
+        )
+        changes: list[GainChange] = []
+        writes: list[ParameterWrite] = []
+        for value, gain_object in zip(current, objects, strict=True):
+            change, write = _plan_drive(gains[value.axis.name], value, gain_object)
+            changes.append(change)
+            writes.append(write)
         folder = record_folder(self.cell)
         return DriveEdit(
             subject=self.subject,
-            before=content_of(base),
-            after=content_of(base, writes),
-            changes=tuple(change for change, _ in planned),
-            unexpected=_changed_since_record(base, folder),
+            before=content_of(current),
+            after=content_of(current, tuple(writes)),
+            changes=tuple(changes),
+            unexpected=_changed_since_record(current, folder),
             folder=folder,
-            values=base,
-            writes=writes,
+            values=current,
+            writes=tuple(writes),
         )
 
     def plan_rollback(self) -> DriveEdit:
@@ -287,30 +304,31 @@ class DriveTarget:
         paths = read_records(folder)
         for path in reversed(paths):
             record = read_record(path)
-            base = read_parameters(self.network, self._recorded(path, record))
-            # A writer that was killed before its first write leaves a record of the current gains.
-            if all(value.word == note.old for value, note in zip(base, record.drives, strict=True)):
+            current = read_parameters(self.network, self._recorded_parameters(path, record))
+            # Nothing to undo: the writer was killed before its first write, or the write was rolled
+            # back.
+            if _has_previous_gains(current, record):
                 continue
-            _check_untouched(path, record, base)
-            writes = tuple(
-                ParameterWrite(value.axis, note.parameter, note.old)
-                for value, note in zip(base, record.drives, strict=True)
-            )
+            _check_untouched(path, record, current)
+            writes = []
+            for value, note in zip(current, record.drives, strict=True):
+                writes.append(ParameterWrite(value.axis, note.parameter, note.old))
             return DriveEdit(
                 subject=self.subject,
-                before=content_of(base),
-                after=content_of(base, writes),
+                before=content_of(current),
+                after=content_of(current, tuple(writes)),
                 source=path,
                 folder=folder,
-                values=base,
-                writes=writes,
+                values=current,
+                writes=tuple(writes),
                 record=record,
             )
+        found = f"no record in {folder}"
+        if paths:
+            found = f"{counted(len(paths), 'record')} of the current gains"
         raise CalibrationRefused(
             self.subject,
-            found=f"{counted(len(paths), 'record')} of the current gains"
-            if paths
-            else f"no record in {folder}",
+            found=found,
             expected="the record of a write that changed them",
             remedy="nothing was written",
         )
@@ -324,23 +342,23 @@ class DriveTarget:
 
     def details(self, edit: DriveEdit) -> Mapping[str, object]:
         """See `Target.details`; values as bits, which are finite."""
-        drives = [
-            {
-                "axis": value.axis.name,
-                "node_id": value.axis.node_id,
-                "serial": value.identity.serial,
-                "object": str(value.parameter),
-                "type": value.parameter.kind.value,
-                "old": value.word,
-                "new": write.word,
-            }
-            for value, write in zip(edit.values, edit.writes, strict=True)
-        ]
-        if edit.source is None:
-            restored = {}
-        else:
-            restored = {"restored": str(edit.source)}
-        return {"saving": self.saving.value, "drives": drives, **restored}
+        drives = []
+        for value, write in zip(edit.values, edit.writes, strict=True):
+            drives.append(
+                {
+                    "axis": value.axis.name,
+                    "node_id": value.axis.node_id,
+                    "serial": value.identity.serial,
+                    "object": str(value.parameter),
+                    "type": value.parameter.kind.value,
+                    "old": value.word,
+                    "new": write.word,
+                }
+            )
+        details: dict[str, object] = {"saving": self.saving.value, "drives": drives}
+        if edit.source is not None:
+            details["restored"] = str(edit.source)
+        return details
 
     def write(self, edit: DriveEdit, now: datetime, who: str) -> Written:
         """See `Target.write` and `drivers.canopen.parameters.write_parameters`.
@@ -348,33 +366,21 @@ class DriveTarget:
         Raises:
             OutputFailed: the record of the previous gains is not on the disk; no drive was written.
         """
-        records: list[Path] = []
+        records: list[Path] = []  # one, once `record_before_writing` was called
 
-        def begin(found: tuple[ParameterValue, ...]) -> None:
-            if content_of(found) != edit.before:
+        def record_before_writing(current: tuple[ParameterValue, ...]) -> None:
+            if content_of(current) != edit.before:
                 raise ControllerChanged(
                     edit.subject,
                     found="other current gains in the drives, or other drives",
                     expected="those that the change was planned for",
                     remedy="take a new dry run; nothing was written",
                 )
-            drives = tuple(
-                DriveNote(
-                    axis=value.axis.name,
-                    node_id=value.axis.node_id,
-                    vendor_id=value.identity.vendor_id,
-                    product_code=value.identity.product_code,
-                    serial=value.identity.serial,
-                    index=value.parameter.index,
-                    subindex=value.parameter.subindex,
-                    type=value.parameter.kind,
-                    old=value.word,
-                    new=write.word,
-                )
-                for value, write in zip(found, edit.writes, strict=True)
-            )
+            drives = []
+            for value, write in zip(current, edit.writes, strict=True):
+                drives.append(_note_of(value, write))
             try:
-                records.append(write_record(edit.folder, self.cell.name, now, who, drives))
+                record = write_record(edit.folder, self.cell.name, now, who, tuple(drives))
             except OSError as error:
                 raise OutputFailed(
                     str(edit.folder),
@@ -382,20 +388,29 @@ class DriveTarget:
                     expected="a record of the previous gains on the disk, before any drive",
                     remedy="nothing was written to the drives; free space or rights",
                 ) from error
+            records.append(record)
 
-        parameters = write_parameters(self.network, edit.writes, self.saving, begin)
+        parameters = write_parameters(self.network, edit.writes, self.saving, record_before_writing)
         return Written(edit, records[0], parameters)
 
-    def _recorded(self, path: Path, record: DriveRecord) -> list[tuple[Axis, DriveParameter]]:
+    def _recorded_parameters(
+        self, path: Path, record: DriveRecord
+    ) -> list[tuple[Axis, DriveParameter]]:
+        """Return the objects that a record names, with the axes of this cell.
+
+        Raises:
+            ControllerUnfit: the record is of another cell, or of other axes.
+        """
         axes = {(axis.name, axis.node_id): axis for axis in self.network.axes}
-        unknown_axes = [
-            note.axis for note in record.drives if (note.axis, note.node_id) not in axes
-        ]
-        present = present_name(self.cell, record.cell, utc(record.at, NEVER))
-        if present != self.cell.name or unknown_axes:
+        unknown_axes = []
+        for note in record.drives:
+            if (note.axis, note.node_id) not in axes:
+                unknown_axes.append(note.axis)
+        name_now = present_name(self.cell, record.cell, utc(record.at, NEVER))
+        if name_now != self.cell.name or unknown_axes:
             found = f"a write to cell {record.cell!r} at {record.at}"
-            if present != record.cell:
-                found += f", which is called {present!r} now"
+            if name_now != record.cell:
+                found += f", which is called {name_now!r} now"
             if unknown_axes:
                 found += f", with {', '.join(unknown_axes)} that this cell does not have"
             raise ControllerUnfit(
@@ -406,6 +421,22 @@ class DriveTarget:
                 "been renamed (`drivegain history`)?",
             )
         return [(axes[note.axis, note.node_id], note.parameter) for note in record.drives]
+
+
+def _note_of(value: ParameterValue, write: ParameterWrite) -> DriveNote:
+    """Return what a record says of one drive: its value now, and the one to be written."""
+    return DriveNote(
+        axis=value.axis.name,
+        node_id=value.axis.node_id,
+        vendor_id=value.identity.vendor_id,
+        product_code=value.identity.product_code,
+        serial=value.identity.serial,
+        index=value.parameter.index,
+        subindex=value.parameter.subindex,
+        type=value.parameter.kind,
+        old=value.word,
+        new=write.word,
+    )
 
 
 _DRIVE_TARGET_FIELDS = {
@@ -425,85 +456,115 @@ def content_of(
         words = [value.word for value in base]
     else:
         words = [write.word for write in writes]
-    listed = [
-        [value.axis.name, value.axis.node_id, value.identity.serial, str(value.parameter), word]
-        for value, word in zip(base, words, strict=True)
-    ]
-    return json.dumps(listed).encode()
+    drives = []
+    for value, word in zip(base, words, strict=True):
+        axis = value.axis
+        drives.append([axis.name, axis.node_id, value.identity.serial, str(value.parameter), word])
+    return json.dumps(drives).encode()
 
 
-def _change(
-    gain: Gain, value: ParameterValue, gain_object: GainObject
+def _plan_drive(
+    gain: Gain, current: ParameterValue, gain_object: GainObject
 ) -> tuple[GainChange, ParameterWrite]:
-    """Plan one drive; a gain that is no number leaves the present bits, and a gate refuses it."""
+    """Plan the write to one drive.
+
+    Args:
+        gain: the identified gain.
+        current: what the object holds now.
+        gain_object: the object, with the factor from the gain to its number.
+
+    Returns:
+        The change of the gain, and the bits to write. A gain that is no number leaves the current
+        bits, and a gate refuses it.
+
+    Raises:
+        ControllerUnfit: the object cannot hold the gain to within its σ.
+    """
     parameter = gain_object.parameter
     factor = gain_object.factor
-    key = f"{value.axis.name}, {parameter}"
-    word = value.word
-    planned = None
-    if is_writable(gain):
-        wanted = factor * gain.value
-        std = abs(factor) * gain.std
-        try:
-            word = parameter.word(wanted)
-        except ValueError as error:
-            raise ControllerUnfit(
-                key,
-                found=str(error),
-                expected="a gain that fits",
-                remedy="check `type` and `factor` in `controller.objects` of the cell file; "
-                "nothing was written",
-            ) from error
-        held = parameter.value(word)
-        if held == 0 or 0 < std < abs(held - wanted):
-            raise ControllerUnfit(
-                key,
-                found=f"{wanted:.6g} ± {std:.2g}, which the number {held:.9g} does not represent",
-                expected="a rounding below σ",
-                remedy="this object is too coarse for the gain: use another one, or another factor "
-                "in `controller.objects`; nothing was written",
-            )
-        planned = (held / factor, f"{held:.9g}")
-    return GainChange.of(gain, key, 0, value.value / factor, planned), ParameterWrite(
-        value.axis, parameter, word
-    )
+    key = f"{current.axis.name}, {parameter}"
+    current_gain = current.value / factor
+    if not is_writable(gain):
+        unchanged = ParameterWrite(current.axis, parameter, current.word)
+        return GainChange.of(gain, key, 0, current_gain, None), unchanged
+    wanted = factor * gain.value
+    std = abs(factor) * gain.std
+    try:
+        word = parameter.word(wanted)
+    except ValueError as error:
+        raise ControllerUnfit(
+            key,
+            found=str(error),
+            expected="a gain that fits",
+            remedy="check `type` and `factor` in `controller.objects` of the cell file; "
+            "nothing was written",
+        ) from error
+    # The number that the object holds for the wanted one: an integer, or a float of 32 bits.
+    representable = parameter.value(word)
+    rounding = abs(representable - wanted)
+    # A gain that was held fixed has σ = 0, which says nothing of a rounding.
+    is_above_std = 0 < std < rounding
+    if representable == 0 or is_above_std:
+        raise ControllerUnfit(
+            key,
+            found=f"{wanted:.6g} ± {std:.2g}, which the number {representable:.9g} does not "
+            "represent",
+            expected="a rounding below σ",
+            remedy="this object is too coarse for the gain: use another one, or another factor "
+            "in `controller.objects`; nothing was written",
+        )
+    new_and_spelling = (representable / factor, f"{representable:.9g}")
+    change = GainChange.of(gain, key, 0, current_gain, new_and_spelling)
+    return change, ParameterWrite(current.axis, parameter, word)
 
 
 def _changed_since_record(
-    base: tuple[ParameterValue, ...], folder: Path
+    current: tuple[ParameterValue, ...], folder: Path
 ) -> tuple[GateFinding, ...]:
-    """Compare the drives with the newest record, as logs do not carry their values.
+    """Return the drives that differ from the newest record, which stands in for the log:
+    logs do not carry the values of the drives.
 
     A drive has the written value, or the one before it, where the write was rolled back or never
     saved. Before the first write there is no record, and nothing to compare with.
     """
-    records = read_records(folder)
-    if not records:
+    paths = read_records(folder)
+    if not paths:
         return ()
+    newest = paths[-1]
     try:
-        notes = {(note.axis, note.parameter): note for note in read_record(records[-1]).drives}
+        record = read_record(newest)
     except ControllerUnfit as error:
-        return ((error.subject, error.found, error.expected, _REVIEW),)
-    found = []
-    for value in base:
+        return ((error.subject, error.found, error.expected, _REVIEW_REMEDY),)
+    notes = {(note.axis, note.parameter): note for note in record.drives}
+    findings = []
+    for value in current:
         note = notes.get((value.axis.name, value.parameter))
-        if note is not None and value.word not in {note.old, note.new}:
-            new = value.parameter.value(note.new)
-            old = value.parameter.value(note.old)
-            expected = (
-                f"{new:.9g}, as written according to {records[-1].name}, or {old:.9g} as "
-                "before that write"
-            )
-            remedy = f"the gain was changed since, or the drive exchanged: {_REVIEW}"
-            found.append(
-                (f"{value.axis.name}, {value.parameter}", f"{value.value:.9g}", expected, remedy)
-            )
-    return tuple(found)
+        if note is None or value.word in {note.old, note.new}:
+            continue
+        subject = f"{value.axis.name}, {value.parameter}"
+        new = value.parameter.value(note.new)
+        old = value.parameter.value(note.old)
+        expected = (
+            f"{new:.9g}, as written according to {newest.name}, or {old:.9g} as before that write"
+        )
+        remedy = f"the gain was changed since, or the drive exchanged: {_REVIEW_REMEDY}"
+        findings.append((subject, f"{value.value:.9g}", expected, remedy))
+    return tuple(findings)
 
 
-def _check_untouched(path: Path, record: DriveRecord, base: tuple[ParameterValue, ...]) -> None:
-    """Refuse a rollback that would lose a change by another hand."""
-    for value, note in zip(base, record.drives, strict=True):
+def _has_previous_gains(current: tuple[ParameterValue, ...], record: DriveRecord) -> bool:
+    """Whether every drive has the gain that it had before a recorded write."""
+    pairs = zip(current, record.drives, strict=True)
+    return all(value.word == note.old for value, note in pairs)
+
+
+def _check_untouched(path: Path, record: DriveRecord, current: tuple[ParameterValue, ...]) -> None:
+    """Refuse a rollback that would lose a change by another hand.
+
+    Raises:
+        ControllerChanged: a drive was exchanged, or has neither gain of the record.
+    """
+    for value, note in zip(current, record.drives, strict=True):
         identity = (value.identity.vendor_id, value.identity.product_code, value.identity.serial)
         if identity != (note.vendor_id, note.product_code, note.serial):
             raise ControllerChanged(

@@ -127,14 +127,16 @@ class Proposal(Generic[E]):
         with what its fit found wrong in the description.
         """
         error = self._refusal
-        said = {(refusal.found, refusal.remedy) for refusal in self.refusals}
+        refused = {(refusal.found, refusal.remedy) for refusal in self.refusals}
         for diagnosis in self.request.calibration.diagnoses:
-            is_said = (diagnosis.found, diagnosis.remedy) in said
-            if diagnosis.name in OF_DESCRIPTION and not is_said:
-                error.add_note(
-                    f"hint: the fit of this calibration found {diagnosis.found}; {diagnosis.remedy}"
-                )
-                break
+            if diagnosis.name not in OF_DESCRIPTION:
+                continue
+            if (diagnosis.found, diagnosis.remedy) in refused:
+                continue
+            error.add_note(
+                f"hint: the fit of this calibration found {diagnosis.found}; {diagnosis.remedy}"
+            )
+            break  # the first one alone
         return error
 
     @property
@@ -145,10 +147,11 @@ class Proposal(Generic[E]):
             return CalibrationRefused(
                 only.subject, found=only.found, expected=only.expected, remedy=only.remedy
             )
-        listed = "".join(f"\n  {refusal}" for refusal in self.refusals)
+        # The list ends its last line; what is expected follows on a line of its own.
+        lines = "".join(f"\n  {refusal}" for refusal in self.refusals)
         return CalibrationRefused(
             self.edit.subject,
-            found=f"{len(self.refusals)} failed checks{listed}\n ",
+            found=f"{len(self.refusals)} failed checks{lines}\n ",
             expected="none",
             remedy="nothing was written",
         )
@@ -207,11 +210,16 @@ def apply(
     recorder = _Recorder(audit, who, now, edit.subject)
     details = {**proposal.target.details(edit), **proposal.request.evidence}
     if proposal.refusals:
-        listed = [
-            {"gate": one.gate.value, "subject": one.subject, "found": one.found}
-            for one in proposal.refusals
-        ]
-        recorder.end(AuditAction.REFUSED, {"refusals": listed, **details})
+        refusals = []
+        for refusal in proposal.refusals:
+            refusals.append(
+                {
+                    "gate": refusal.gate.value,
+                    "subject": refusal.subject,
+                    "found": refusal.found,
+                }
+            )
+        recorder.end(AuditAction.REFUSED, {"refusals": refusals, **details})
         raise proposal.error
     if not edit.has_effect:
         recorder.end(AuditAction.NOTHING_TO_DO, {"sha256_found": sha256(edit.after), **details})
@@ -220,10 +228,12 @@ def apply(
     actions = (AuditAction.APPLY_BEGUN, AuditAction.APPLIED)
     written = _write(proposal.target, edit, recorder, actions, details, details)
     try:
-        return replace(written, not_in_history=_complete_history(proposal, recorder))
-    except BaseException as error:  # an interrupt: the write is done
+        not_in_history = _complete_history(proposal, recorder)
+    except BaseException as error:
+        # An interrupt: whoever reads of it must know that the write is done.
         error.add_note(f"kept: {_IN_PLACE.format(edit.subject)}")
         raise
+    return replace(written, not_in_history=not_in_history)
 
 
 @checks_arguments(
@@ -259,12 +269,16 @@ def rollback(
         AuditUnusable: the beginning could not be recorded; nothing was written.
     """
     target.check_fields()
-    asked = {"asked": "rollback"}
-    recorder = _Recorder(audit, who, now, target.subject if planned is None else planned.subject)
-    with recorder.refusals(asked):
+    refused_details = {"asked": "rollback"}
+    if planned is None:
+        subject = target.subject
+    else:
+        subject = planned.subject
+    recorder = _Recorder(audit, who, now, subject)
+    with recorder.refusals(refused_details):
         edit = planned or target.plan_rollback()
     actions = (AuditAction.ROLLBACK_BEGUN, AuditAction.ROLLED_BACK)
-    return _write(target, edit, recorder, actions, target.details(edit), asked)
+    return _write(target, edit, recorder, actions, target.details(edit), refused_details)
 
 
 def _write(
@@ -275,41 +289,70 @@ def _write(
     details: Mapping[str, object],
     refused_details: Mapping[str, object],
 ) -> Written:
-    """Write under the lock, between the two entries of the audit."""
-    with contextlib.ExitStack() as held:
+    """Write under the lock, between the two entries of the audit.
+
+    Args:
+        target: where.
+        edit: the change.
+        recorder: makes the entries.
+        actions: that of the first entry, and that of the last one if all goes well.
+        details: what the first entry says besides the digests.
+        refused_details: what the entry says if the lock refuses the write.
+
+    Raises:
+        CalibrationRefused, DriverError, OSError, OutputFailed, AuditUnusable: see `apply`.
+    """
+    begun_action, done_action = actions
+    with contextlib.ExitStack() as lock:
         with recorder.refusals(refused_details):
-            held.enter_context(target.lock(edit))
-        before = None if edit.before is None else sha256(edit.before)
-        digests = {"sha256_before": before, "sha256_after": sha256(edit.after)}
-        begun = recorder.begin(actions[0], {**digests, **details, **_absence_of_log(recorder)})
+            lock.enter_context(target.lock(edit))
+        digest_before = None if edit.before is None else sha256(edit.before)
+        digest_after = sha256(edit.after)
+        begun = recorder.begin(
+            begun_action,
+            {
+                "sha256_before": digest_before,
+                "sha256_after": digest_after,
+                **details,
+                **_note_of_absent_log(recorder),
+            },
+        )
         try:
             written = target.write(edit, recorder.at, recorder.who)
-        except BaseException as error:  # an interrupt ends a write too
+        # An interrupt ends a write, too.
+        except BaseException as error:
             # It may come when all is done: the digest shows the content, whatever the error says.
-            found = digest_now(edit.subject)
-            made = edit.has_effect and found == digests["sha256_after"]
+            found_digest = digest_now(edit.subject)
+            is_new_in_place = edit.has_effect and found_digest == digest_after
+            is_old_in_place = found_digest == (digest_before or GONE)
             if begun is not None:
-                says = {"begun": begun.number, "error": f"{type(error).__name__}: {error}"[:500]}
-                recorder.end(
-                    actions[1] if made else AuditAction.FAILED, {**says, "sha256_found": found}
-                )
-            if isinstance(error, OSError) and found != (before or GONE):
-                raise _disturbed(edit, error, made=made) from error
-            if made:
+                last_action = done_action if is_new_in_place else AuditAction.FAILED
+                failure = {
+                    "begun": begun.number,
+                    "error": f"{type(error).__name__}: {error}"[:500],
+                    "sha256_found": found_digest,
+                }
+                recorder.end(last_action, failure)
+            if isinstance(error, OSError) and not is_old_in_place:
+                raise _error_after_replacement(edit, error, is_made=is_new_in_place) from error
+            if is_new_in_place:
                 error.add_note(f"kept: {_IN_PLACE.format(edit.subject)}")
             raise
         if begun is not None:
-            recorder.end(actions[1], {"begun": begun.number})
+            recorder.end(done_action, {"begun": begun.number})
         return written
 
 
-def _absence_of_log(recorder: _Recorder) -> dict[str, object]:
+def _note_of_absent_log(recorder: _Recorder) -> dict[str, object]:
     """Return what a new audit log says of the one that is absent; empty where none is missed.
+
+    Backups of earlier writes without an audit log show that there was one.
 
     The write goes on: who removed the log must not thereby keep a technician from rolling back.
     """
     subject = Path(recorder.subject)
-    if recorder.audit is None or not subject.is_absolute():  # drives have no backups in files
+    is_file = subject.is_absolute()  # drives have a name, and no backups next to them
+    if recorder.audit is None or not is_file:
         return {}
     count = backups_without_log(recorder.audit, subject)
     if count == 0:
@@ -333,9 +376,8 @@ def _complete_history(proposal: Proposal[E], recorder: _Recorder) -> str:
     """
     cell = proposal.target.cell
     if cell is None or recorder.audit is None:
-        ledger = None
-    else:
-        ledger = Ledger.of(cell, recorder.audit)
+        return ""
+    ledger = Ledger.of(cell, recorder.audit)
     if ledger is None:
         return ""
     request = proposal.request
@@ -344,10 +386,11 @@ def _complete_history(proposal: Proposal[E], recorder: _Recorder) -> str:
         enter_calibration(
             ledger, request.calibration, digest=digest, who=recorder.who, at=recorder.at
         )
-        if (
-            not proposal.edit.has_effect
-            and read_history(ledger).in_force(recorder.subject) != digest
-        ):
+        if proposal.edit.has_effect:
+            return ""
+        # Nothing had to be written: an entry says that the target has these gains all the same.
+        in_force = read_history(ledger).in_force(recorder.subject)
+        if in_force != digest:
             details = {
                 "action": WriteAction.APPLIED.value,
                 "begun": None,
@@ -368,21 +411,25 @@ def _complete_history(proposal: Proposal[E], recorder: _Recorder) -> str:
 _IN_PLACE = "{} has the new content, complete; the history lacks this write"
 
 
-def _disturbed(edit: Edit, error: OSError, *, made: bool) -> OutputFailed:
+def _error_after_replacement(edit: Edit, error: OSError, *, is_made: bool) -> OutputFailed:
     """Return the error for a write after which the content is the new one, or is not known."""
-    entering = (
-        "`drivegain history CELL --add CALIBRATION` enters it, `drivegain rollback CELL` undoes it"
-    )
-    asking = (
-        f"whether {edit.subject} has the new content is not known: compare it with the newest "
-        "backup next to it"
-    )
+    if is_made:
+        when = "after"
+        advice = (
+            f"{_IN_PLACE.format(edit.subject)}: `drivegain history CELL --add CALIBRATION` enters "
+            "it, `drivegain rollback CELL` undoes it"
+        )
+    else:
+        when = "during"
+        advice = (
+            f"whether {edit.subject} has the new content is not known: compare it with the newest "
+            "backup next to it"
+        )
     return OutputFailed(
         edit.subject,
-        found=f"{reason_of(error)}, {'after' if made else 'during'} the replacement",
+        found=f"{reason_of(error)}, {when} the replacement",
         expected="a file system that completes what it began",
-        remedy="check the disk; "
-        f"{_IN_PLACE.format(edit.subject) + ': ' + entering if made else asking}",
+        remedy=f"check the disk; {advice}",
     )
 
 
@@ -398,7 +445,14 @@ class _Recorder:
     subject: str  #: the file, with symbolic links followed, or the drives
 
     def begin(self, action: AuditAction, details: Mapping[str, object]) -> AuditEntry | None:
-        """Append an entry; where that fails, nothing may be written."""
+        """Append an entry; where that fails, nothing may be written.
+
+        Returns:
+            The entry; None where nothing is recorded.
+
+        Raises:
+            OutputFailed, AuditUnusable: the audit log takes no entry.
+        """
         if self.audit is None:
             return None
         try:
@@ -414,7 +468,7 @@ class _Recorder:
             ) from error
 
     def end(self, action: AuditAction, details: Mapping[str, object]) -> AuditEntry | None:
-        """Append the last entry about the write; a failure is a warning."""
+        """Append the last entry about the write; a failure is a warning, and returns None."""
         try:
             return self.begin(action, details)
         except (OutputFailed, AuditUnusable) as error:
