@@ -475,7 +475,7 @@ def payload_of(calibration: Calibration, data: Dataset) -> FloatArray | None:
 
 
 def _require_same_mass(calibration: Calibration, payload: Payload, run: str) -> None:
-    """Refuse another mass than that of the fit.
+    """Refuse another mass than that of the fit on the same mounting.
 
     What was identified with one mass, first moments and inertia, is not that of a body of another
     mass.
@@ -483,20 +483,43 @@ def _require_same_mass(calibration: Calibration, payload: Payload, run: str) -> 
     Raises:
         DataUnfit: the payload has another mass.
     """
-    own_sources = [source for source in calibration.sources if source.payload == payload.name]
-    masses_kg = {source.mass_kg for source in own_sources}
-    fitted_kg = next(iter(masses_kg - {None}), None)
     mass_kg = payload.known.get("m")
-    if mass_kg is None or not fitted_kg:
+    if mass_kg is None:
         return
-    difference = abs(mass_kg / fitted_kg - 1.0)
-    if not difference <= SAME_MASS:
+    fitted_kg = _fitted_masses_kg(calibration, payload, payload.mounting)
+    is_same = all(_is_same_mass(mass_kg, one_kg) for one_kg in fitted_kg)
+    if not fitted_kg:
+        # Earlier versions did not write the mounting: any of their masses may have been on it.
+        fitted_kg = _fitted_masses_kg(calibration, payload, None)
+        is_same = not fitted_kg or any(_is_same_mass(mass_kg, one_kg) for one_kg in fitted_kg)
+    if not is_same:
+        expected = " or ".join(f"{one_kg:g}" for one_kg in fitted_kg)
         raise DataUnfit(
             run,
-            f"payload {payload.name!r} weighs {mass_kg:g} kg; expected {fitted_kg:g} kg as in the "
+            f"payload {payload.name!r} weighs {mass_kg:g} kg; expected {expected} kg as in the "
             f"fit: the calibration holds the rest of its inertia on mounting {payload.mounting!r}; "
             "give another body another mounting",
         )
+
+
+def _fitted_masses_kg(
+    calibration: Calibration, payload: Payload, mounting: str | None
+) -> tuple[float, ...]:
+    """Masses [kg] of a payload in the runs of the fit that name this mounting, the smallest first.
+
+    A held-out run has identified nothing, so its mass is none of them.
+    """
+    found: set[float] = set()
+    for source in calibration.sources:
+        is_own = source.payload == payload.name and source.mounting == mounting
+        if is_own and source.role == "fit" and source.mass_kg:
+            found.add(source.mass_kg)
+    return tuple(sorted(found))
+
+
+def _is_same_mass(mass_kg: float, fitted_kg: float) -> bool:
+    """Whether two weighings may be of one body."""
+    return abs(mass_kg / fitted_kg - 1.0) <= SAME_MASS
 
 
 def _check_mounting(
