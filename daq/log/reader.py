@@ -492,6 +492,19 @@ def read_log(path: Path | str) -> Log:
     )
 
 
+def read_cell_of(log: Path) -> Cell:
+    """Read the cell of a log from its beginning, whatever comes after its first samples.
+
+    Raises:
+        LogUnreadable: its beginning cannot be read.
+        ConfigurationError: its configuration is inconsistent.
+    """
+    reader = LogReader(log)
+    for _ in reader:  # what comes before the samples has the configuration
+        break
+    return reader.head.cell(log)
+
+
 def joined(blocks: Iterable[SampleBlock]) -> SampleBlock:
     """Return all samples of a log, of one block at least, as one block."""
     waiting = list(blocks)
