@@ -95,11 +95,11 @@ def _require_unmarked(path: Path, target: Path) -> None:
         OSError: one of the two cannot be opened, for another reason than missing rights.
     """
     for place in (target, target.parent):
-        if _is_marked(place):
+        if is_marked(place):
             raise FileImmutable(path, place)
 
 
-def _is_marked(place: Path) -> bool:
+def is_marked(place: Path) -> bool:
     """Whether a file or folder is immutable or append-only; not where that cannot be asked."""
     try:
         descriptor = os.open(place, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
