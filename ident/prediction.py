@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ident.arrays import FloatArray, as_array, takes
+from ident.arrays import LARGEST_NUMBER, FloatArray, as_array, require_size, takes
 from ident.calibration import EXTRAPOLATED, AcceptedEffect, Calibration, Parameter
 from ident.data.dataset import Dataset
 from ident.effects.effect import (
@@ -176,6 +176,7 @@ def measured_torque(
     if current.ndim != 2 or current.shape[1] != len(gains):
         expected = f"(n_samples, {len(gains)}), one column per motor"
         raise ModelError(f"current_a has shape {current.shape}; expected {expected}; transpose it?")
+    require_size("current_a", current, ModelError, "give amperes")
     torque = np.asarray((gains * current) @ model.drive_train.direction)
     if motion is None or not model.is_redundant:
         return torque
@@ -445,7 +446,34 @@ def _gains(calibration: Calibration, model: Model) -> FloatArray:
     gains = [gain.value for gain in calibration.gains]
     if len(gains) != count:
         raise ModelError(f"the calibration has {len(gains)} gains, the model {count} joints")
+    _require_numbers(calibration)
     return np.array(gains)
+
+
+def _require_numbers(calibration: Calibration) -> None:
+    """Refuse a calibration made by a program with numbers that predict none; files have none.
+
+    Raises:
+        ModelError: a gain is zero, or a number is not finite or too large.
+    """
+    for gain in calibration.gains:
+        if not 1.0 / LARGEST_NUMBER <= abs(gain.value) <= LARGEST_NUMBER:
+            raise _wrong_number(calibration, f"gain of {gain.axis}", gain.value)
+    parameters = list(calibration.parameters)
+    for effect in calibration.effects:
+        parameters.extend(effect.coefficients)
+    for parameter in parameters:
+        if not abs(parameter.value) <= LARGEST_NUMBER:
+            raise _wrong_number(calibration, f"parameter {parameter.name}", parameter.value)
+
+
+def _wrong_number(calibration: Calibration, name: str, value: float) -> ModelError:
+    """Error for a number of a calibration that no fit gives."""
+    return ModelError(
+        f"the calibration of cell {calibration.cell!r} has the {name} {value:g}; expected a number "
+        f"of a fit, at most {LARGEST_NUMBER:g} in size, and no gain of zero; give the calibration "
+        "as it was fitted or read"
+    )
 
 
 def payload_of(calibration: Calibration, data: Dataset) -> FloatArray | None:
