@@ -168,6 +168,15 @@ def is_taken(path: Path) -> bool:
     return path.exists() or path.is_symlink()
 
 
+def what_has_name(path: Path) -> str:
+    """Say what has a name that is taken: a folder, a link that leads nowhere, or a file."""
+    if path.is_dir():
+        return "a folder of that name"
+    if path.is_symlink() and not path.exists():
+        return f"a link of that name to {path.readlink()}, where nothing is"
+    return "a file of that name"
+
+
 def follow_links(path: Path) -> Path:
     """Resolve the symbolic links of a name, those of its folders included,
     as long as they can be trusted.

@@ -25,7 +25,7 @@ from rich.text import Text
 from daq.cli.output import release_results
 from daq.cli.verb import judged_output
 from daq.errors import OutputFailed, UsageError, first_few, writing
-from daq.files import is_taken, replace_file
+from daq.files import is_taken, replace_file, what_has_name
 from daq.report.text import break_lines, terminal_text
 
 if TYPE_CHECKING:
@@ -237,12 +237,14 @@ def check_replaceable(out: Path, mark: str, kind: str) -> None:
         with out.open("rb") as stream:
             head = stream.read(4096)
         replaceable = not head or mark.encode() in head
+        found = f"an existing file that is no {kind}"
     else:
         replaceable = not is_taken(out)
+        found = what_has_name(out)
     if not replaceable:
         raise UsageError(
             str(out),
-            found=f"an existing file that is no {kind}",
+            found=found,
             expected="no file, or an earlier one of the same kind",
             remedy="choose another name, or move it away",
         )
