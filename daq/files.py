@@ -95,11 +95,11 @@ def _require_unmarked(path: Path, target: Path) -> None:
         OSError: one of the two cannot be opened, for another reason than missing rights.
     """
     for place in (target, target.parent):
-        if _is_marked(place):
+        if is_marked(place):
             raise FileImmutable(path, place)
 
 
-def _is_marked(place: Path) -> bool:
+def is_marked(place: Path) -> bool:
     """Whether a file or folder is immutable or append-only; not where that cannot be asked."""
     try:
         descriptor = os.open(place, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
@@ -166,6 +166,15 @@ def is_taken(path: Path) -> bool:
     a new file of that name would replace it, or be made elsewhere.
     """
     return path.exists() or path.is_symlink()
+
+
+def what_has_name(path: Path) -> str:
+    """Say what has a name that is taken: a folder, a link that leads nowhere, or a file."""
+    if path.is_dir():
+        return "a folder of that name"
+    if path.is_symlink() and not path.exists():
+        return f"a link of that name to {path.readlink()}, where nothing is"
+    return "a file of that name"
 
 
 def follow_links(path: Path) -> Path:

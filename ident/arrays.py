@@ -20,6 +20,7 @@ IntArray = NDArray[np.int64]
 Refusal = Callable[[str], Exception]
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
+LARGEST_NUMBER = 1e30  #: Size of a number, in any unit: products of three of them are still finite
 
 
 def as_array(
@@ -149,10 +150,38 @@ def require_number(
         raise ModelError(
             f"{label} is {value!r:.60} of type {type_name}; expected {bound}; {remedy}"
         )
-    number = float(value)  # type: ignore[arg-type]  # isinstance does not narrow through the name above
+    number = as_float(value)
     if not above < number < np.inf:
         raise ModelError(f"{label} is {number:g}; expected {bound}; {remedy}")
+    # A divisor may not be too small, either.
+    is_too_small = above >= 0.0 and number < 1.0 / LARGEST_NUMBER
+    if is_too_small or abs(number) > LARGEST_NUMBER:
+        sizes = f"{1.0 / LARGEST_NUMBER:g} to {LARGEST_NUMBER:g} in size"
+        raise ModelError(f"{label} is {number:g}; expected {bound}, {sizes}; {remedy}")
     return number
+
+
+def as_float(value: object) -> float:
+    """Convert a number; a whole one that no float holds is infinite, with its sign."""
+    try:
+        return float(value)  # type: ignore[arg-type]  # a number of any type
+    except OverflowError:
+        return float(np.copysign(np.inf, 1 if value > 0 else -1))  # type: ignore[operator]
+
+
+def require_size(label: str, array: FloatArray, refuse: Refusal, remedy: str) -> None:
+    """Refuse finite numbers whose products are not finite, as ``refuse(…)``."""
+    largest = float(np.max(np.abs(array), initial=0.0))
+    if largest <= LARGEST_NUMBER:
+        return
+    place = np.unravel_index(int(np.argmax(np.abs(array))), array.shape)
+    where = ""
+    if array.ndim == 2:
+        where = f" in sample {place[0]}, axis {place[1] + 1}"
+    raise refuse(
+        f"{label} has {array[place]:g}{where}; expected at most {LARGEST_NUMBER:g} in size; "
+        f"{remedy}"
+    )
 
 
 def require_count(label: str, value: object, *, remedy: str = "give a number such as 0") -> int:

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ident.arrays import FloatArray, as_array, takes
+from ident.arrays import LARGEST_NUMBER, FloatArray, as_array, require_size, takes
 from ident.calibration import EXTRAPOLATED, AcceptedEffect, Calibration, Parameter
 from ident.data.dataset import Dataset
 from ident.effects.effect import (
@@ -176,6 +176,7 @@ def measured_torque(
     if current.ndim != 2 or current.shape[1] != len(gains):
         expected = f"(n_samples, {len(gains)}), one column per motor"
         raise ModelError(f"current_a has shape {current.shape}; expected {expected}; transpose it?")
+    require_size("current_a", current, ModelError, "give amperes")
     torque = np.asarray((gains * current) @ model.drive_train.direction)
     if motion is None or not model.is_redundant:
         return torque
@@ -445,7 +446,34 @@ def _gains(calibration: Calibration, model: Model) -> FloatArray:
     gains = [gain.value for gain in calibration.gains]
     if len(gains) != count:
         raise ModelError(f"the calibration has {len(gains)} gains, the model {count} joints")
+    _require_numbers(calibration)
     return np.array(gains)
+
+
+def _require_numbers(calibration: Calibration) -> None:
+    """Refuse a calibration made by a program with numbers that predict none; files have none.
+
+    Raises:
+        ModelError: a gain is zero, or a number is not finite or too large.
+    """
+    for gain in calibration.gains:
+        if not 1.0 / LARGEST_NUMBER <= abs(gain.value) <= LARGEST_NUMBER:
+            raise _wrong_number(calibration, f"gain of {gain.axis}", gain.value)
+    parameters = list(calibration.parameters)
+    for effect in calibration.effects:
+        parameters.extend(effect.coefficients)
+    for parameter in parameters:
+        if not abs(parameter.value) <= LARGEST_NUMBER:
+            raise _wrong_number(calibration, f"parameter {parameter.name}", parameter.value)
+
+
+def _wrong_number(calibration: Calibration, name: str, value: float) -> ModelError:
+    """Error for a number of a calibration that no fit gives."""
+    return ModelError(
+        f"the calibration of cell {calibration.cell!r} has the {name} {value:g}; expected a number "
+        f"of a fit, at most {LARGEST_NUMBER:g} in size, and no gain of zero; give the calibration "
+        "as it was fitted or read"
+    )
 
 
 def payload_of(calibration: Calibration, data: Dataset) -> FloatArray | None:
@@ -475,7 +503,7 @@ def payload_of(calibration: Calibration, data: Dataset) -> FloatArray | None:
 
 
 def _require_same_mass(calibration: Calibration, payload: Payload, run: str) -> None:
-    """Refuse another mass than that of the fit.
+    """Refuse another mass than that of the fit on the same mounting.
 
     What was identified with one mass, first moments and inertia, is not that of a body of another
     mass.
@@ -483,20 +511,43 @@ def _require_same_mass(calibration: Calibration, payload: Payload, run: str) -> 
     Raises:
         DataUnfit: the payload has another mass.
     """
-    own_sources = [source for source in calibration.sources if source.payload == payload.name]
-    masses_kg = {source.mass_kg for source in own_sources}
-    fitted_kg = next(iter(masses_kg - {None}), None)
     mass_kg = payload.known.get("m")
-    if mass_kg is None or not fitted_kg:
+    if mass_kg is None:
         return
-    difference = abs(mass_kg / fitted_kg - 1.0)
-    if not difference <= SAME_MASS:
+    fitted_kg = _fitted_masses_kg(calibration, payload, payload.mounting)
+    is_same = all(_is_same_mass(mass_kg, one_kg) for one_kg in fitted_kg)
+    if not fitted_kg:
+        # Earlier versions did not write the mounting: any of their masses may have been on it.
+        fitted_kg = _fitted_masses_kg(calibration, payload, None)
+        is_same = not fitted_kg or any(_is_same_mass(mass_kg, one_kg) for one_kg in fitted_kg)
+    if not is_same:
+        expected = " or ".join(f"{one_kg:g}" for one_kg in fitted_kg)
         raise DataUnfit(
             run,
-            f"payload {payload.name!r} weighs {mass_kg:g} kg; expected {fitted_kg:g} kg as in the "
+            f"payload {payload.name!r} weighs {mass_kg:g} kg; expected {expected} kg as in the "
             f"fit: the calibration holds the rest of its inertia on mounting {payload.mounting!r}; "
             "give another body another mounting",
         )
+
+
+def _fitted_masses_kg(
+    calibration: Calibration, payload: Payload, mounting: str | None
+) -> tuple[float, ...]:
+    """Masses [kg] of a payload in the runs of the fit that name this mounting, the smallest first.
+
+    A held-out run has identified nothing, so its mass is none of them.
+    """
+    found: set[float] = set()
+    for source in calibration.sources:
+        is_own = source.payload == payload.name and source.mounting == mounting
+        if is_own and source.role == "fit" and source.mass_kg:
+            found.add(source.mass_kg)
+    return tuple(sorted(found))
+
+
+def _is_same_mass(mass_kg: float, fitted_kg: float) -> bool:
+    """Whether two weighings may be of one body."""
+    return abs(mass_kg / fitted_kg - 1.0) <= SAME_MASS
 
 
 def _check_mounting(

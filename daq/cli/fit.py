@@ -216,6 +216,8 @@ def fit_verb(request: FitRequest) -> None:
         )
     prior = _read_prior(request)
     with status("identifying"):
+        if request.wants_full:
+            _require_prior(request, prior)
         found = _fit(request)
         calibration = calibration_of_case(found, datetime.now(UTC))
         if request.wants_full:
@@ -288,6 +290,21 @@ def _read_prior(request: FitRequest) -> tuple[str, str] | None:
         return None
     text = urdf_text(read_yaml_bytes(request.prior), str(request.prior))
     return request.prior.name, text
+
+
+def _require_prior(request: FitRequest, prior: tuple[str, str] | None) -> None:
+    """Refuse a prior of another robot before the fit, which would be lost.
+
+    The cell is that of --cell, else that of the first log.
+    """
+
+    from daq.log.reader import read_cell_of
+    from daq.workflow.full_parameters import OF_CELL, require_prior, require_std_by_moves
+
+    require_std_by_moves(request.method, gains_fixed=request.gains_fixed)
+    cell = corrected_cell(request.cell) or read_cell_of(request.logs[0])
+    name, urdf = prior or (OF_CELL, cell.urdf)
+    require_prior(cell, urdf, name)
 
 
 def _full_set(request: FitRequest, fitted: Fit, prior: tuple[str, str] | None) -> FullSet:

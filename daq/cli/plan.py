@@ -68,6 +68,7 @@ def plan_verb(
     from daq.workflow.plan import load_plan, plan, save_plan
     from ident.planning.gain_verdict import verdicts
 
+    check_folder(out)
     check_output(out, (cell,), "drivegain-plan")
     if preview is not None:
         if os.path.realpath(preview) == os.path.realpath(out):

@@ -24,7 +24,7 @@ from daq.cli.verb import (
 )
 from daq.environment import login
 from daq.errors import DiskSpaceShort, ExitCode, OutputFailed, UsageError, counted
-from daq.files import is_taken
+from daq.files import is_taken, what_has_name
 from drivers.errors import POWERED, DriverError, SampleLost, all_notes, error_chain
 
 if TYPE_CHECKING:
@@ -200,7 +200,7 @@ def _free(out: Path) -> Path:
         "the rest of a recording of that name that failed, was interrupted, or is still running"
     )
     for path, found, remedy in (
-        (out, "a file of that name", "choose another --out, or move it away"),
+        (out, what_has_name(out), "choose another --out, or move it away"),
         (part, unfinished, f"`fit` does not read it; {_next_command(part)}"),
     ):
         if is_taken(path):

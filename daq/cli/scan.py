@@ -48,8 +48,8 @@ def scan_verb(
     changed without --reset-faults; find out why an axis is in fault before you reset it. While a
     recording or another master uses the bus, nothing is sent: exit code 12 or 5. Of a cell file
     that other verbs refuse, the buses and node ids are enough; what is missing is said. Exit code 5
-    also where an axis does not answer; what else is wrong is in the table, as another serial number
-    is, and `record` refuses it.
+    also where an axis does not answer, as one of which heartbeats alone are heard; what else is
+    wrong is in the table, as another serial number is, and `record` refuses it.
     """
     from daq.config.cell_buses import bus_parts
     from daq.config.wiring import read_wiring
@@ -87,10 +87,15 @@ def scan_verb(
         print_json(report)
     else:
         print_view(scan_view(report))
+    heard = tuple(chain.from_iterable(found.values()))
     absent = {node.node_id for node in listed if node.verdict == "missing"}
+    for name, nodes in found.items():
+        absent |= _unanswering(wiring, name, nodes)
     missing = [_amplifier(axis) for axis in wiring.axes if axis.node_id in absent]
     if missing:
-        answered = tuple(node.node_id for node in chain.from_iterable(found.values()))
+        answered = tuple(node.node_id for node in heard if node.answers)
+        if heard:  # a bus with heartbeats alone is not empty
+            raise NodeMissing(missing, answered, wait)
         raise no_answer(wiring, missing, answered, wait)
     if (
         not json
@@ -145,6 +150,15 @@ def _scan_bus(
     with CanopenNetwork(address, axes) as network:
         nodes = network.scan(wait_s=wait_s)
     return ScannedBus(nodes, scales, misfits, causes)
+
+
+def _unanswering(wiring: Wired, bus: str, nodes: Sequence[FoundNode]) -> set[int]:
+    """Node ids of the axes of a bus of which heartbeats alone are heard, as of a stopped node.
+
+    A device that is no axis of the cell may be without an SDO server.
+    """
+    own = {axis.node_id for axis in wiring.axes if axis.bus == bus}
+    return {node.node_id for node in nodes if not node.answers and node.node_id in own}
 
 
 def no_answer(

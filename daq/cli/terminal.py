@@ -4,6 +4,7 @@ and Ctrl-C.
 
 from __future__ import annotations
 
+import os
 import shutil
 import signal
 import stat
@@ -25,7 +26,7 @@ from rich.text import Text
 from daq.cli.output import release_results
 from daq.cli.verb import judged_output
 from daq.errors import OutputFailed, UsageError, first_few, writing
-from daq.files import is_taken, replace_file
+from daq.files import is_taken, replace_file, what_has_name
 from daq.report.text import break_lines, terminal_text
 
 if TYPE_CHECKING:
@@ -155,7 +156,17 @@ def _files_of(path: Path) -> dict[Path, _FileState]:
 def make_folder(folder: Path) -> None:
     """Create a folder, with its parents, before there is anything to put into it;
     it is removed if it stays empty.
+
+    Raises:
+        UsageError: a file, or a link that leads nowhere, has its name.
     """
+    if is_taken(folder) and not folder.is_dir():
+        raise UsageError(
+            str(folder),
+            found=what_has_name(folder),
+            expected="a folder, or a new name",
+            remedy="choose another name, or move it away",
+        )
     missing = [one for one in (folder, *folder.parents) if not one.exists()]
     _MADE.extend(reversed(missing))
     folder.mkdir(parents=True, exist_ok=True)
@@ -170,6 +181,7 @@ def remove_empty_folders() -> None:
 
 def check_output(out: Path | None, inputs: Iterable[Path | None], format_: str) -> None:
     """Refuse to overwrite an input, or a file that does not begin with its format."""
+    check_link(out)
     if out is None or not out.exists():
         return
     if any(given is not None and _is_same(out, given) for given in inputs):
@@ -204,12 +216,26 @@ def require_different(out: Path | None, **folders: Path | None) -> None:
 
 def check_folder(out: Path | None) -> None:
     """Refuse, before the work is done, an output file in a folder that does not exist."""
+    check_link(out)
     if out is not None and not out.parent.is_dir():
         raise OutputFailed(
             str(out),
             found="no such folder",
             expected="a folder that exists",
             remedy="create it, or choose another",
+        )
+
+
+def check_link(out: Path | None) -> None:
+    """Refuse, before the work is done, a link into a folder that does not exist."""
+    if out is None or out.exists() or not out.is_symlink():
+        return
+    if not Path(os.path.realpath(out)).parent.is_dir():
+        raise OutputFailed(
+            str(out),
+            found=what_has_name(out),
+            expected="a link into a folder that exists",
+            remedy="remove the link, or create that folder",
         )
 
 
@@ -237,12 +263,14 @@ def check_replaceable(out: Path, mark: str, kind: str) -> None:
         with out.open("rb") as stream:
             head = stream.read(4096)
         replaceable = not head or mark.encode() in head
+        found = f"an existing file that is no {kind}"
     else:
         replaceable = not is_taken(out)
+        found = what_has_name(out)
     if not replaceable:
         raise UsageError(
             str(out),
-            found=f"an existing file that is no {kind}",
+            found=found,
             expected="no file, or an earlier one of the same kind",
             remedy="choose another name, or move it away",
         )

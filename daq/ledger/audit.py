@@ -15,6 +15,7 @@ import contextlib
 import errno
 import fcntl
 import json
+import logging
 import os
 import stat
 import time
@@ -26,8 +27,9 @@ from enum import Enum
 from pathlib import Path
 
 from daq.errors import AuditUnusable, WriteUnconfirmed, counted, reason_of
-from daq.files import follow_links, fsync_folder, read_regular, sha256, sha256_of
+from daq.files import follow_links, fsync_folder, is_marked, read_regular, sha256, sha256_of
 
+_LOG = logging.getLogger("drivegain")
 MAX_BYTES = 2**30  #: Largest audit log; it is read whole
 _TRIES, _PAUSE_S = 100, 0.05  #: For the lock, which is held for one line
 FIRST = "0" * 64  #: Previous digest of the first entry
@@ -214,6 +216,8 @@ def append(
 ) -> AuditEntry:
     """Append an entry durably; a new file is made in an existing folder.
 
+    A note next to it that cannot be written is a warning: the entry is on the disk.
+
     Raises:
         AuditUnusable: no regular file, locked for long, or its last line is not what was written.
         OSError: from the file system; nothing was written.
@@ -226,6 +230,8 @@ def append(
         with os.fdopen(descriptor, "rb", closefd=False) as stream:
             content = stream.read()
         last, unfinished = _end_of(content, path)
+        # The entries of one write have one time: the first of them warns for all.
+        is_first = last is None or (last.at, last.who) != (at.isoformat(), who)
         line = b"" if not content or content.endswith(b"\n") else b"\n"
         if unfinished:
             torn = _torn_details(unfinished)
@@ -240,7 +246,11 @@ def append(
                 fsync_folder(Path(os.path.realpath(path)).parent)
         except OSError as error:
             raise WriteUnconfirmed.of(path, error) from error
-        _note_head(path, content, new.sha256)
+        try:
+            _note_head(path, content, new.sha256)
+        except OSError as error:
+            if is_first:
+                _LOG.warning("%s", _says_not_noted(path, error))
         return new
 
 
@@ -293,22 +303,65 @@ def head_file(path: Path) -> Path:
     return target.with_name(f"{target.name}.head")
 
 
+def note_obstacle(path: Path) -> str:
+    """Say why the next entry of an audit log could not be noted; empty where it could."""
+    try:
+        os.close(_open_note(path))
+    except FileNotFoundError:
+        return ""  # it will be made
+    except OSError as error:
+        return _says_not_noted(path, error)
+    return ""
+
+
+def _says_not_noted(path: Path, error: OSError) -> str:
+    """Say what it means that the note next to an audit log cannot be written, and what to do."""
+    note = head_file(path)
+    reason = reason_of(error)
+    remedy = "free space or rights"
+    if note.is_symlink() or (note.exists() and not note.is_file()):
+        remedy = "remove what has its name"
+    elif is_marked(note) or is_marked(note.parent):
+        reason = "marked as immutable or append-only"
+        remedy = "take off the mark (`chattr -i -a`)"
+    return (
+        f"the digest of the last entry cannot be noted in {note} ({reason}): a missing end of the "
+        f"audit log would not be noticed; {remedy}, and the next entry is noted again"
+    )
+
+
+def _open_note(path: Path, flags: int = 0) -> int:
+    """Open the note next to an audit log for writing, never through a link.
+
+    Raises:
+        OSError: it cannot be written, or is no regular file.
+    """
+    note = head_file(path)
+    flags |= os.O_WRONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
+    descriptor = os.open(note, flags, 0o666)
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise OSError(errno.EINVAL, "something that is no regular file", str(note))
+    return descriptor
+
+
 def _note_head(path: Path, content: bytes, head: str) -> None:
     """Note the last entry; the caller has the lock, and `content` is what was before it.
 
     The note is older than the log after a kill, which is harmless: the chain has older entries too.
+
+    Raises:
+        OSError: the note cannot be written.
     """
     missing = [one for one in noted_heads(path) if one.encode() not in content]
     noted = "".join(f"{one}\n" for one in (*missing, head)).encode()
-    flags = os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
-    with contextlib.suppress(OSError):  # the entry is on the disk, and a note can be missing
-        descriptor = os.open(head_file(path), flags, 0o666)
-        try:
-            # In place: there are never fewer lines than before, but where a missing entry came
-            # back, or where the disk takes a part and no more.
-            _replace_in_place(descriptor, noted)
-        finally:
-            os.close(descriptor)
+    descriptor = _open_note(path, os.O_CREAT)
+    try:
+        # In place: there are never fewer lines than before, but where a missing entry came back,
+        # or where the disk takes a part and no more.
+        _replace_in_place(descriptor, noted)
+    finally:
+        os.close(descriptor)
 
 
 def _replace_in_place(descriptor: int, lines: bytes) -> None:

@@ -39,6 +39,7 @@ from daq.ledger.audit import (
     begun_by,
     entry_after,
     head_file,
+    note_obstacle,
     noted_heads,
     verify,
 )
@@ -133,6 +134,7 @@ class Verification:
     unknown: tuple[AuditedWrite, ...] = ()  #: writes that the history lacks
     #: whether the last entry of the audit log is noted, without which a missing end does not show
     noted: bool = True
+    note_obstacle: str = ""  #: why the next entry cannot be noted either; empty where it can
 
     @property
     def complete(self) -> bool:
@@ -223,8 +225,17 @@ def verify_ledger(ledger: Ledger, heads: Collection[str] = ()) -> Verification:
         return Verification(ledger.audit, verdict, replace(history, may_lack=True), broken)
     known = history.digests
     unknown = unknown_writes(ledger.cell, entries, verdict.open_writes, known)
-    is_noted = bool(noted) or not verdict.entries
-    return Verification(ledger.audit, verdict, history, broken, unknown, noted=is_noted)
+    is_noted = not verdict.entries or verdict.entries[-1].sha256 in noted
+    obstacle = note_obstacle(ledger.audit)
+    return Verification(
+        ledger.audit,
+        verdict,
+        history,
+        broken,
+        unknown,
+        noted=is_noted,
+        note_obstacle=obstacle,
+    )
 
 
 def record_write(

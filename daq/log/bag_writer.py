@@ -19,7 +19,7 @@ from mcap.writer import CompressionType, Writer
 from daq.config.cell import Cell, joint_names
 from daq.config.same_cell import require_cell_of
 from daq.errors import ConfigurationInconsistent, OutputFailed, UsageError
-from daq.files import fsync_folder
+from daq.files import fsync_folder, is_taken, what_has_name
 from daq.log.conversion import continuous_counts, scaling
 from daq.log.message import (
     CURRENTS_TOPIC,
@@ -70,15 +70,15 @@ def export_bag(path: Path, out: Path, calibration: Calibration | None = None) ->
             effort.
 
     Raises:
-        UsageError: a file or folder of that name exists.
+        UsageError: a file, folder or link of that name exists.
         OutputFailed: the file system refuses; nothing is left.
         ConfigurationInconsistent: the calibration is of another cell than the log.
         LogUnreadable: the log is damaged or incomplete; nothing is written.
     """
-    if out.exists():
+    if is_taken(out):
         raise UsageError(
             str(out),
-            found="a file or folder of that name",
+            found=what_has_name(out),
             expected="none",
             remedy="choose another --out",
         )

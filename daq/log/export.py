@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from daq.config.cell import Cell, CellAxis
 from daq.errors import ConfigurationMissing, OutputFailed, UsageError
+from daq.files import is_taken, what_has_name
 from daq.log.conversion import answers, moves, readings_by_axis, scaling, unwrapped
 from daq.log.message import RawArray
 from daq.log.motion import judge_log
@@ -61,7 +62,7 @@ def export_log(log: Path, out: Path, kind: TableFormat) -> Exported:
         kind: format of the file.
 
     Raises:
-        UsageError: a file of that name exists.
+        UsageError: a file, folder or link of that name exists.
         OutputFailed: the file system refuses.
         ConfigurationMissing: the package for the format is missing; the message names the extra to
             install.
@@ -81,7 +82,7 @@ def require_new_table(out: Path, kind: TableFormat) -> None:
     """Refuse, before any work is done, a table that cannot be written.
 
     Raises:
-        UsageError: a file of that name exists.
+        UsageError: a file, folder or link of that name exists.
         ConfigurationMissing: the package for the format is missing; the message names the extra to
             install.
     """
@@ -93,10 +94,10 @@ def require_new_table(out: Path, kind: TableFormat) -> None:
             expected="that of the optional extra `parquet`",
             remedy="pip install 'drivegain[parquet]', or export --csv",
         )
-    if out.exists():
+    if is_taken(out):
         raise UsageError(
             str(out),
-            found="a file of that name",
+            found=what_has_name(out),
             expected="none",
             remedy="choose another --out, or move it away",
         )

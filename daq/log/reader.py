@@ -53,6 +53,8 @@ STEP_TOLERANCE = 0.5
 
 From half a period on it could be another cycle.
 """
+#: From this step on no SYNC came late: a recorder would have counted the cycles in between as lost
+NO_LATE_SYNC_NS = 1_000_000_000
 #: Largest relative difference between the requested rate and that of the time stamps
 RATE_TOLERANCE = 0.01
 
@@ -217,16 +219,7 @@ class SampleChecks:
         step_ns = max(self._steps, key=lambda step_ns: abs(step_ns - period_ns))
         # Central differences assume evenly spaced samples.
         if abs(step_ns - period_ns) > STEP_TOLERANCE * period_ns:
-            step_ms = step_ns * 1e-6
-            period_ms = period_ns * 1e-6
-            step = self._steps[step_ns].format(f"{step_ms:.4g} ms")
-            return ClockImplausible(
-                path,
-                found=f"{step}, its most uneven step",
-                expected=f"{period_ms:.4g} ms, give or take {100.0 * STEP_TOLERANCE:g} %",
-                remedy="SYNC came late: record again with less load on the computer, or with a "
-                "longer sync.period_us",
-            )
+            return self._uneven(step_ns, period_ns)
         stamped_hz = (self.samples - 1) * 1e9 / self.span_ns
         if abs(stamped_hz / rate_hz - 1.0) > RATE_TOLERANCE:
             return ClockImplausible(
@@ -236,6 +229,32 @@ class SampleChecks:
                 remedy="was the computer's clock set during the run? record it again",
             )
         return None
+
+    def _uneven(self, step_ns: int, period_ns: float) -> ClockImplausible:
+        """Error for the most uneven step of the stamps.
+
+        A recorder stamps by a monotonic clock, and counts a period without SYNC as a lost cycle.
+        """
+        step = f"{step_ns * 1e-6:.4g} ms"
+        remedy = (
+            "SYNC came late: record again with less load on the computer, or with a longer "
+            "sync.period_us"
+        )
+        if abs(step_ns) >= NO_LATE_SYNC_NS:
+            step = f"{step_ns * 1e-9:.4g} s"
+        if not 0 < step_ns < NO_LATE_SYNC_NS:
+            remedy = (
+                "a recorder's stamps have one direction, whatever the clock of its computer: "
+                "another tool has changed the log; take the original, or record again"
+            )
+        period_ms = period_ns * 1e-6
+        found = self._steps[step_ns].format(step)
+        return ClockImplausible(
+            str(self._path),
+            found=f"{found}, its most uneven step",
+            expected=f"{period_ms:.4g} ms, give or take {100.0 * STEP_TOLERANCE:g} %",
+            remedy=remedy,
+        )
 
     def verdict(self, rate_hz: float, statistics: RunStatistics) -> tuple[bool, str]:
         """Return whether the run is valid by its recorder and by its samples, and why not."""
@@ -490,6 +509,19 @@ def read_log(path: Path | str) -> Log:
         statistics=reader.statistics,
         partial=reader.partial,
     )
+
+
+def read_cell_of(log: Path) -> Cell:
+    """Read the cell of a log from its beginning, whatever comes after its first samples.
+
+    Raises:
+        LogUnreadable: its beginning cannot be read.
+        ConfigurationError: its configuration is inconsistent.
+    """
+    reader = LogReader(log)
+    for _ in reader:  # what comes before the samples has the configuration
+        break
+    return reader.head.cell(log)
 
 
 def joined(blocks: Iterable[SampleBlock]) -> SampleBlock:

@@ -19,7 +19,7 @@ from mcap.writer import CompressionType, Writer
 
 from daq.config.cell import Cell, joint_names
 from daq.errors import OutputFailed, UsageError, reason_of
-from daq.files import fsync_folder, is_taken
+from daq.files import fsync_folder, is_taken, what_has_name
 from daq.log.container import UNFINISHED
 from daq.log.message import (
     CURRENTS_TOPIC,
@@ -143,7 +143,7 @@ class LogWriter:
         if is_taken(self.path):
             raise UsageError(
                 str(self.path),
-                found="a file of that name",
+                found=what_has_name(self.path),
                 expected="none",
                 remedy="choose another name, or move it away",
             )

@@ -349,7 +349,8 @@ def _verdict(
     if node.shared:
         return "two devices"
     expected = axis.identity
-    if expected is not None and node.identity is None:
+    is_unknown = expected is not None or not node.answers
+    if is_unknown and node.identity is None:
         return "no identity"
     if expected is not None and node.identity is not None:
         differing = expected.differences(node.identity)
@@ -381,6 +382,15 @@ NO_IDENTITY = (
     "again with a longer `--wait`; if it stays so, switch the drive off and on"
 )
 
+NO_ANSWER = (
+    "found heartbeats of the node, and no answer to a request (SDO); expected an answer; scan "
+    "again with `--wait 2`; if it stays so, switch the drive off and on"
+)
+STOPPED = (
+    "found the node in NMT state STOPPED, in which it answers no request (SDO); expected "
+    "PRE-OPERATIONAL; end the program that has stopped it, or switch the drive off and on"
+)
+
 
 def _remarks(node: FoundNode, expected: Identity | None) -> Iterator[str]:
     """Describe what is wrong with a node."""
@@ -391,9 +401,18 @@ def _remarks(node: FoundNode, expected: Identity | None) -> Iterator[str]:
         yield from differing
         if differing:
             yield OTHER_DRIVE
-    if expected is not None and node.identity is None and not node.problems:
+    if not node.answers:
+        yield _unanswering(node)
+    elif expected is not None and node.identity is None and not node.problems:
         yield NO_IDENTITY
     yield from node.problems
+
+
+def _unanswering(node: FoundNode) -> str:
+    """Say what to do about a node of which heartbeats alone are heard."""
+    from drivers.canopen.link import NmtState  # noqa: PLC0415 - `info` shows currents without the CAN library
+
+    return STOPPED if node.nmt == NmtState.STOPPED else NO_ANSWER
 
 
 _POWER = {True: "ENABLED", False: "off", None: "?"}

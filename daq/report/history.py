@@ -416,11 +416,13 @@ def say_verification(found: Verification, console: Console) -> None:
         chain = "unbroken"
     entries = counted(len(verdict.entries), "entry")
     console.print(f"{found.audit}: {entries}, chain {chain}.")
-    if not found.noted:
+    if not found.noted and not found.note_obstacle:
         console.print(
             f"No {head_file(found.audit).name} with the digest of the last entry: a missing end of "
             "the audit log would not be noticed. The next entry writes it again."
         )
+    if found.note_obstacle:
+        console.print(printable(f"NOT NOTED: {found.note_obstacle}"))
     if verdict.torn:
         lines = ", ".join(map(str, verdict.torn))
         console.print(

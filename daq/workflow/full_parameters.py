@@ -10,7 +10,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from daq.config.cell import Cell
+from daq.config.cell import Cell, model_of
 from daq.errors import ConfigurationInconsistent, UsageError
 from daq.workflow.diagnoses import by_likelihood
 from daq.workflow.fit import Fit
@@ -19,9 +19,14 @@ from ident.effects.effect import Property
 from ident.errors import ModelError
 from ident.estimators.estimate import Estimate
 from ident.estimators.method import Method
-from ident.model.robot import Joint
+from ident.model.robot import Joint, Robot
 from ident.model.urdf import read_urdf
-from ident.physical.full_parameters import FullParameters, LinkPrior, full_parameters
+from ident.physical.full_parameters import (
+    FullParameters,
+    LinkPrior,
+    full_parameters,
+    require_serial,
+)
 from ident.physical.full_set import FullParameter, FullSet, GainWithPrior
 from ident.physical.prior_check import PriorCheck
 
@@ -48,7 +53,7 @@ def full_set(fitted: Fit, urdf: str, name: str, tolerance: float) -> FullSet:
         NotPhysical: no possible robot was found.
     """
     cell = fitted.cell
-    links = _links_of(cell, fitted.identification.model.robot.joints, urdf, name)
+    links = _links_of(cell, fitted.identification.model.robot, urdf, name)
     prior = LinkPrior(links, tolerance)
     final = fitted.final
     effects = fitted.steps[-1].after.effects if fitted.steps else ()
@@ -58,12 +63,7 @@ def full_set(fitted: Fit, urdf: str, name: str, tolerance: float) -> FullSet:
     try:
         found = full_parameters(final.system, _with_std_by_moves(fitted), prior, friction)
     except ModelError as error:
-        raise UsageError(
-            "--prior",
-            found=str(error),
-            expected="a serial robot with all of its base parameters",
-            remedy="fit without --prior and --prior-tolerance",
-        ) from error
+        raise _unfit_robot(error) from error
     of_links = np.full(len(found.names), np.nan)
     of_links[final.model.link_columns] = links
     gains: tuple[GainWithPrior, ...] = ()
@@ -90,6 +90,57 @@ def full_set(fitted: Fit, urdf: str, name: str, tolerance: float) -> FullSet:
     )
 
 
+def require_prior(cell: Cell, urdf: str, name: str) -> None:
+    """Refuse what is no prior of a cell's robot, before the fit, which takes long.
+
+    Args:
+        cell: of the logs.
+        urdf: text of the URDF with the prior's inertias.
+        name: of it, in messages.
+
+    Raises:
+        UsageError: the robot has a closed chain, or the URDF has no inertia for one of its links.
+        ConfigurationInconsistent: the URDF is of another robot.
+        ModelError: the cell describes no robot.
+    """
+    robot = model_of(cell).robot
+    _links_of(cell, robot, urdf, name)
+    try:
+        require_serial(robot)
+    except ModelError as error:
+        raise _unfit_robot(error) from error
+
+
+def _unfit_robot(error: ModelError) -> UsageError:
+    """Error for a robot or a fit whose standard parameters cannot be found."""
+    return UsageError(
+        "--prior",
+        found=str(error),
+        expected="a serial robot with all of its base parameters",
+        remedy="fit without --prior and --prior-tolerance",
+    )
+
+
+def require_std_by_moves(method: Method | None, *, gains_fixed: bool) -> None:
+    """Refuse an estimator whose gains have no σ by moves: ``ml`` would change them.
+
+    Args:
+        method: None for the estimator that a fit chooses.
+        gains_fixed: the gains are held, so that ``ml`` fits the same parameters.
+
+    Raises:
+        UsageError: the estimator is another one, and the gains are free.
+    """
+    if method is None or method.is_of_currents or gains_fixed:
+        return
+    raise UsageError(
+        f"--method {method.value}",
+        found="--prior or --prior-tolerance with it",
+        expected=f"{Method.ML.value}, whose σ comes from leaving out moves",
+        remedy="leave out --method",
+    )
+
+
 def _with_std_by_moves(fitted: Fit) -> Estimate:
     """Return the estimate with σ from leaving out moves.
 
@@ -103,13 +154,7 @@ def _with_std_by_moves(fitted: Fit) -> Estimate:
     estimate = fitted.estimate
     if estimate.method.is_of_currents:
         return estimate
-    if not estimate.gains_fixed:
-        raise UsageError(
-            f"--method {estimate.method.value}",
-            found="--prior or --prior-tolerance with it",
-            expected=f"{Method.ML.value}, whose σ comes from leaving out moves",
-            remedy="leave out --method",
-        )
+    require_std_by_moves(estimate.method, gains_fixed=estimate.gains_fixed)
     return by_likelihood(estimate, fitted.final.system)
 
 
@@ -163,8 +208,9 @@ def _parameters(found: FullParameters, of_links: FloatArray) -> Iterator[FullPar
         )
 
 
-def _links_of(cell: Cell, joints: tuple[Joint, ...], urdf: str, name: str) -> FloatArray:
-    """Links of a prior, shape (n, 10), of a URDF with the joints of a cell."""
+def _links_of(cell: Cell, robot: Robot, urdf: str, name: str) -> FloatArray:
+    """Links of a prior, shape (n, 10), of a URDF with the joints of a cell's robot."""
+    joints = robot.joints
     try:
         found = read_urdf(urdf)
     except ModelError as error:

@@ -44,6 +44,7 @@ class FoundNode:
     statusword: int | None  #: 6041h, or None when it is no CiA 402 drive
     shared: str = ""  #: evidence that two devices have this node id
     problems: tuple[str, ...] = ()  #: objects that it reports badly, with the reason
+    answers: bool = True  #: to SDO requests; False for one of which heartbeats alone are heard
 
     @property
     def state(self) -> State | None:
@@ -118,6 +119,7 @@ def _unanswering_node(node_id: int) -> FoundNode:
         device_name=None,
         nmt=None,
         statusword=None,
+        answers=False,
     )
 
 

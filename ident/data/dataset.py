@@ -17,6 +17,7 @@ from ident.arrays import (
     as_array,
     require_number,
     require_real,
+    require_size,
     takes,
 )
 from ident.data.channel_faults import (
@@ -63,6 +64,8 @@ LARGEST_JITTER = 0.01  #: Range of the steps of time, as a share of their median
 MEDIAN_OF_NORMAL = 0.6745  #: Median of |Z| of a standard normal Z
 #: Sizes of a current, in whatever unit, whose squares and their sums are exact enough
 SMALLEST_CURRENT, LARGEST_CURRENT = 1e-30, 1e30
+
+IN_SI = "give radians (metres for prismatic joints) and seconds"
 
 LONGEST_MOVE_S = 2.0
 """Two seconds are some forty correlation times of the residual (lag one about 0.67 at 50 rows a
@@ -240,6 +243,7 @@ def _checked(
     shape = (len(time_s), axes)
     each = "one row per entry of time_s, one column per axis"
     position = as_array("position_rad", run.position_rad, shape, each, refuse)
+    require_size("position_rad", position, refuse, IN_SI)
     current = as_array("current_a", run.current_a, shape, each, refuse)
     _require_squares(current, refuse)
     usable = None
@@ -385,7 +389,7 @@ def planned(motion: Motion, rate_hz: float, payload: Payload | None = None) -> D
         payload: what is mounted, None without load.
 
     Raises:
-        DataUnfit: the shapes differ, or a number is not finite.
+        DataUnfit: the shapes differ, there is no sample, or a number is not finite or too large.
         ModelError: an argument is of another type, or the rate is not above zero.
     """
     refuse = partial(DataUnfit, "planned motion")
@@ -401,6 +405,11 @@ def planned(motion: Motion, rate_hz: float, payload: Payload | None = None) -> D
             f"{shape}, {velocity.shape} and {acceleration.shape}; expected (n_samples, n_axes) each"
         )
         raise refuse(f"position, velocity and acceleration have the shapes {found}")
+    if not shape[0]:
+        raise refuse("found no sample; expected one or more; give the motion to predict")
+    require_size("position_rad", position, refuse, IN_SI)
+    require_size("velocity_rad_s", velocity, refuse, IN_SI)
+    require_size("acceleration_rad_s2", acceleration, refuse, IN_SI)
     everywhere = np.ones(shape, dtype=np.bool_)
     return Dataset(
         name="planned motion",

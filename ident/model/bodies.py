@@ -16,12 +16,12 @@ linear in the ten parameters: a linear matrix inequality.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from math import inf, isfinite
+from math import isfinite
 from numbers import Real
 
 import numpy as np
 
-from ident.arrays import FloatArray, require_kind
+from ident.arrays import LARGEST_NUMBER, FloatArray, as_float, require_kind
 from ident.errors import ModelError
 
 LOADED = "_loaded"
@@ -72,19 +72,26 @@ class Payload:
         require_kind(
             "mass_tolerance_kg", self.mass_tolerance_kg, Real, "give kilograms, such as 0.01"
         )
-        if not 0.0 <= self.mass_tolerance_kg < inf:
-            found = f"a mass tolerance of {self.mass_tolerance_kg:g} kg"
+        tolerance_kg = as_float(self.mass_tolerance_kg)
+        if not 0.0 <= tolerance_kg <= LARGEST_NUMBER:
+            found = f"a mass tolerance of {tolerance_kg:g} kg"
             raise ModelError(
                 f"payload {self.name!r} has {found}; expected zero or more; give that of the scale"
             )
-        not_finite: list[str] = []
+        beyond: list[str] = []
+        are_finite = True
         for name, value in self.known.items():
-            if not isfinite(value):
-                not_finite.append(f"{name} = {value}")
-        if not_finite:
-            found = ", ".join(not_finite)
+            size = abs(as_float(value))
+            if not size <= LARGEST_NUMBER:
+                beyond.append(f"{name} = {as_float(value):g}")
+                are_finite = are_finite and isfinite(size)
+        if beyond:
+            found = ", ".join(beyond)
+            expected = "finite numbers"
+            if are_finite:
+                expected = f"numbers of at most {LARGEST_NUMBER:g} in size"
             raise ModelError(
-                f"payload {self.name!r} has {found}; expected finite numbers; leave out "
+                f"payload {self.name!r} has {found}; expected {expected}; leave out "
                 "what is not known"
             )
         mass_kg = self.known.get("m")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import fcntl
 import os
 import re
 import stat
@@ -16,6 +15,7 @@ import pytest
 
 from daq.errors import FileImmutable, OutputFailed, OwnerNotKept
 from daq.files import replace_file
+from tests.daq.file_marks import APPEND_ONLY, IMMUTABLE, file_mark
 
 ACCESS = "system.posix_acl_access"
 DEFAULT = "system.posix_acl_default"
@@ -222,27 +222,7 @@ def test_an_owner_that_cannot_be_kept_is_no_matter_of_free_space() -> None:
     assert "free space" in other.remedy
 
 
-_FS_IOC_GETFLAGS = 0x80086601
-_FS_IOC_SETFLAGS = 0x40086602
-_IMMUTABLE = 0x10
-_APPEND_ONLY = 0x20
-
-
-def _mark(place: Path, bit: int, *, is_set: bool) -> None:
-    """Set or clear one mark, as chattr does; OSError where user or file system cannot."""
-    descriptor = os.open(place, os.O_RDONLY)
-    answer = bytearray(struct.calcsize("l"))
-    try:
-        fcntl.ioctl(descriptor, _FS_IOC_GETFLAGS, answer)
-        marks = struct.unpack("l", answer)[0] & ~bit
-        if is_set:
-            marks |= bit
-        fcntl.ioctl(descriptor, _FS_IOC_SETFLAGS, struct.pack("l", marks))
-    finally:
-        os.close(descriptor)
-
-
-@pytest.mark.parametrize("bit", [_IMMUTABLE, _APPEND_ONLY], ids=["immutable", "append-only"])
+@pytest.mark.parametrize("bit", [IMMUTABLE, APPEND_ONLY], ids=["immutable", "append-only"])
 @pytest.mark.parametrize("of_folder", [False, True], ids=["file", "folder"])
 def test_a_mark_of_the_file_system_is_named_with_the_command_that_takes_it_off(
     tmp_path: Path, bit: int, of_folder: bool
@@ -253,15 +233,8 @@ def test_a_mark_of_the_file_system_is_named_with_the_command_that_takes_it_off(
     path = folder / "controller.yaml"
     path.write_bytes(b"old")
     marked = folder if of_folder else path
-    try:
-        _mark(marked, bit, is_set=True)
-    except OSError as error:
-        pytest.skip(f"this user or file system sets no such mark: {error.strerror}")
-    try:
-        with pytest.raises(FileImmutable) as caught:
-            replace_file(path, b"new")
-    finally:
-        _mark(marked, bit, is_set=False)
+    with file_mark(marked, bit), pytest.raises(FileImmutable) as caught:
+        replace_file(path, b"new")
     failed = OutputFailed.of(path, caught.value)
     assert failed.found == f"{marked} is marked as immutable or append-only (`chattr`)"
     assert f"`chattr -i -a '{marked}'`" in failed.remedy

@@ -157,6 +157,42 @@ def test_a_payload_of_another_mass_is_not_predicted(example: SimpleNamespace) ->
     ).all()
 
 
+@pytest.mark.parametrize("other_kg", [1.5, 6.0])
+def test_the_mass_of_a_payload_is_that_of_the_fit_on_its_mounting(
+    example: SimpleNamespace, other_kg: float
+) -> None:
+    """Neither its mass on another mounting nor that of a held-out run was identified there."""
+    found = example.main()
+    calibration = ident.calibration_of(found, ("J1", "J2", "J3"), example.NAMEPLATE_NM_A)
+    elsewhere = ident.Source("first", "", "fit", payload="disc", mass_kg=other_kg, mounting="elbow")
+    held_out = replace(elsewhere, role="holdout", mounting="flange")
+    sources = (elsewhere, *calibration.sources, held_out)
+    several = replace(calibration, sources=sources)
+    other = ident.Payload("disc", mounting="flange", known={"m": other_kg})
+    other_motion = ident.planned(_slow_motion(), 100.0, other)
+    with pytest.raises(ident.DataUnfit, match=rf"weighs {other_kg:g} kg; expected 4.59 kg as in"):
+        ident.predict_torque(several, found.model, other_motion)
+    own_motion = ident.planned(_slow_motion(), 100.0, example.DISC)
+    assert np.isfinite(ident.predict_torque(several, found.model, own_motion)).all()
+
+
+def test_a_calibration_without_mountings_names_each_mass(example: SimpleNamespace) -> None:
+    """Earlier versions did not write the mounting, so any of the masses may have been on it."""
+    found = example.main()
+    calibration = ident.calibration_of(found, ("J1", "J2", "J3"), example.NAMEPLATE_NM_A)
+    disc = replace(calibration.sources[0], mounting=None)
+    lighter = replace(disc, mass_kg=1.5)
+    earlier = replace(calibration, sources=(disc, lighter))
+    for mass_kg in (1.5, example.DISC.known["m"]):
+        payload = ident.Payload("disc", mounting="flange", known={"m": mass_kg})
+        motion = ident.planned(_slow_motion(), 100.0, payload)
+        assert np.isfinite(ident.predict_torque(earlier, found.model, motion)).all()
+    heavier = ident.Payload("disc", mounting="flange", known={"m": 6.0})
+    motion = ident.planned(_slow_motion(), 100.0, heavier)
+    with pytest.raises(ident.DataUnfit, match=r"weighs 6 kg; expected 1.5 or 4.59 kg as in"):
+        ident.predict_torque(earlier, found.model, motion)
+
+
 def test_another_payload_on_a_known_mounting_is_not_predicted(example: SimpleNamespace) -> None:
     """What the calibration holds of the mounting is the inertia of the disc, not of a box."""
     found = example.main()

@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from daq.cli.app import VERBS, main
+from daq.cli.terminal import make_folder
 from daq.config.cell_file import load_cell
 from daq.documents.calibration_file import save_calibration
 from daq.errors import ConfigurationError, ExitCode, UsageError
@@ -272,6 +273,94 @@ def test_a_log_does_not_begin_under_the_name_of_a_link_that_leads_nowhere(
     """Its last step, the rename, would find the name taken."""
     (tmp_path / "a.mcap").symlink_to(tmp_path / "gone.mcap")
     path = tmp_path / "a.mcap"
-    with pytest.raises(UsageError, match="found a file of that name; expected none"):
+    with pytest.raises(UsageError, match=r"found a link .* to .*gone.mcap, where nothing is"):
         write(path, demo_content(checkout), samples([[0] * 6] * 5))
     assert not (tmp_path / "a.mcap.part").exists()
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["fit", "a.mcap", "--out"],
+        ["residual", "a.mcap", "--report", "r", "--out"],
+        ["plan", "demo.yaml", "--out"],
+        ["export", "urdf", "demo.yaml", "c.yaml", "--out"],
+        ["export", "mjcf", "demo.yaml", "c.yaml", "--out"],
+    ],
+    ids=lambda words: " ".join(words[:2]),
+)
+def test_a_link_into_a_folder_that_is_not_there_is_refused_before_any_work(
+    words: list[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """The work was done and lost: "free space or rights". The inputs here are not even there."""
+    monkeypatch.chdir(tmp_path)
+    link = tmp_path / "link"
+    link.symlink_to("gone/there")
+    assert main([*words, "link"]) == ExitCode.UNEXPECTED
+    said = " ".join(capsys.readouterr().err.split())
+    assert "found: a link of that name to gone/there, where nothing is" in said
+    assert "create that folder" in said
+    assert list(tmp_path.iterdir()) == [link]
+
+
+def test_a_plan_for_a_folder_that_is_not_there_is_refused_before_the_planning(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The cell file is not even there."""
+    cell = str(tmp_path / "demo.yaml")
+    assert main(["plan", cell, "--out", str(tmp_path / "no" / "p.yaml")]) == ExitCode.UNEXPECTED
+    assert "no such folder" in capsys.readouterr().err
+
+
+def test_a_folder_of_pictures_that_is_a_link_to_nothing_is_called_that(tmp_path: Path) -> None:
+    """It was "file exists … free space or rights"."""
+    (tmp_path / "link").symlink_to("gone")
+    with pytest.raises(UsageError, match="found a link of that name to gone, where nothing is"):
+        make_folder(tmp_path / "link")
+    (tmp_path / "file").touch()
+    with pytest.raises(UsageError, match="found a file of that name; expected a folder"):
+        make_folder(tmp_path / "file")
+
+
+#: Words of a verb before the name of its output
+WRITING = {
+    "certificate": ["certificate", "calibration.yaml", "--out"],
+    "salvage": ["salvage", "a.mcap.part", "--out"],
+    "export csv": ["export", "csv", "calibration.yaml", "a.mcap", "--out"],
+    "export bag": ["export", "bag", "a.mcap", "--out"],
+}
+
+
+@pytest.mark.parametrize("words", WRITING.values(), ids=WRITING)
+def test_an_output_that_is_a_folder_or_a_link_to_nothing_is_called_that(
+    words: list[str],
+    checkout: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Both were called files, and `export csv` replaced the link."""
+    monkeypatch.chdir(tmp_path)
+    save_calibration(demo_calibration(), tmp_path / "calibration.yaml")
+    write(tmp_path / "a.mcap", demo_content(checkout), samples([[0] * 6] * 5))
+    whole = (tmp_path / "a.mcap").read_bytes()
+    (tmp_path / "a.mcap.part").write_bytes(whole[:-100])
+    suffixes = {"certificate": ".html", "salvage": ".mcap", "export csv": ".csv"}
+    suffix = suffixes.get(" ".join(words[:2]), suffixes.get(words[0], ""))
+    folder = tmp_path / f"folder{suffix}"
+    folder.mkdir()
+    link = tmp_path / f"link{suffix}"
+    link.symlink_to("gone")
+    before = sorted(tmp_path.rglob("*"))
+    for out, words_of_it in (
+        (folder, "a folder of that name"),
+        (link, "a link of that name to gone, where nothing is"),
+    ):
+        assert main([*words, str(out)]) == ExitCode.USAGE
+        said = " ".join(capsys.readouterr().err.split())
+        assert words_of_it in said
+    assert sorted(tmp_path.rglob("*")) == before
+    assert link.is_symlink()

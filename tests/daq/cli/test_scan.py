@@ -26,8 +26,10 @@ from daq.config.cell_file import bundle, cell_from_bundle
 from daq.errors import ExitCode
 from daq.log.reader import read_log
 from daq.report.bus_views import (
+    NO_ANSWER,
     NO_IDENTITY,
     OTHER_DRIVE,
+    STOPPED,
     scan_report,
     scan_table,
     scan_view,
@@ -36,7 +38,7 @@ from daq.report.bus_views import (
 from daq.simulation.simulation_file import load_simulation, shipped_simulation
 from daq.workflow.bus_lock import bus_lock
 from drivers.canopen.bus import open_bus
-from drivers.canopen.link import BEATS_KEPT, Link
+from drivers.canopen.link import BEATS_KEPT, Link, NmtState
 from drivers.canopen.node_scan import FoundNode
 from drivers.canopen.sdo import SdoPolicy
 from drivers.messages import EventKind
@@ -48,6 +50,8 @@ from ident.model.model import DriveTrain
 from tests.daq.command_line import run_verb
 from tests.faults.test_scenario import PLAN
 from tests.two_buses import on_two_buses
+
+STOP_NODE = 2  #: Command of NMT (CiA 301)
 
 
 def _node(node_id: int, statusword: int | None, serial: int | None = None) -> FoundNode:
@@ -223,6 +227,64 @@ def test_a_node_that_answers_no_request_is_remarked(cell: Cell) -> None:
     overloaded = replace(beating, problems=("object 1018h:01: 64 answers to other requests",))
     (row, *_) = scanned_nodes(cell, (overloaded,), "demo")
     assert row.remarks == list(overloaded.problems)
+
+
+def test_a_silent_axis_without_declared_identity_is_not_called_ok(cell: Cell) -> None:
+    axes = (replace(cell.axes[0], identity=None), *cell.axes[1:])
+    cell = replace(cell, axes=axes)
+    beating = FoundNode(1, None, None, None, NmtState.STOPPED, None, answers=False)
+    (row, *_) = scanned_nodes(cell, (beating,), "demo")
+    assert (row.verdict, row.remarks) == ("no identity", [STOPPED])
+    (row, *_) = scanned_nodes(cell, (replace(beating, nmt=NmtState.OPERATIONAL),), "demo")
+    assert (row.verdict, row.remarks) == ("no identity", [NO_ANSWER])
+
+
+@pytest.mark.parametrize("silent", [(3,), (1, 2, 3, 4, 5, 6)], ids=["one", "every"])
+def test_axes_that_only_send_heartbeats_are_no_success(
+    checkout: Path,
+    cell: Cell,
+    capsys: pytest.CaptureFixture[str],
+    silent: tuple[int, ...],
+) -> None:
+    """It ended with 0: the table said `no identity`, and nothing else did."""
+    with (
+        open_bus(bus_address(cell)) as bus,
+        SimulatedCell(load_simulation(shipped_simulation("clean")), bus) as simulated,
+    ):
+        for node in simulated.nodes:
+            if node.node_id in silent:
+                node.write(0x1017, 0, (20).to_bytes(2, "little"))
+                node.command_nmt(STOP_NODE, 0.0)
+        code = run_verb("scan", checkout / "configs/cells/demo.yaml", "--json")
+    assert code == ExitCode.DEVICE_FAULT
+    printed = capsys.readouterr()
+    failure = json.loads(printed.err)
+    assert failure["kind"] == "NodeMissing"
+    rows = json.loads(printed.out)["nodes"]
+    unanswering = [row["node_id"] for row in rows if row["remarks"] == [STOPPED]]
+    assert unanswering == list(silent)
+    for node_id in silent:
+        assert f"J{node_id} (node {node_id})" in failure["found"]
+
+
+def test_a_foreign_node_that_only_sends_heartbeats_is_no_failure(
+    checkout: Path, cell: Cell, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A device that is no axis may be without an SDO server."""
+    operational = bytes([NmtState.OPERATIONAL])
+    beat = can.Message(arbitration_id=0x700 + 77, data=operational, is_extended_id=False)
+    with (
+        open_bus(bus_address(cell)) as bus,
+        open_bus(bus_address(cell)) as foreign,
+        SimulatedCell(load_simulation(shipped_simulation("clean")), bus),
+    ):
+        beats = foreign.send_periodic(beat, 0.05)
+        code = run_verb("scan", checkout / "configs/cells/demo.yaml", "--json")
+        beats.stop()
+    assert code == ExitCode.OK
+    rows = json.loads(capsys.readouterr().out)["nodes"]
+    assert rows[-1]["node_id"] == 77
+    assert rows[-1]["remarks"] == [NO_ANSWER]
 
 
 def test_two_devices_and_a_profile_that_does_not_fit_are_said(cell: Cell) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import random
+import re
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -36,6 +37,7 @@ from daq.ledger.ledger import (
 from ident.calibration import Calibration
 from tests.daq.calibrations import AXES, calibration_for, demo_calibration
 from tests.daq.command_line import run_verb
+from tests.daq.file_marks import IMMUTABLE, file_mark
 from tests.daq.histories import (
     BEGIN,
     calibration_of,
@@ -525,6 +527,70 @@ def test_a_log_without_its_note_is_said_to_be_one(
     capsys.readouterr()
     assert run_verb("history", cell_file, "--verify") == ExitCode.OK
     assert "cannot be seen" not in capsys.readouterr().out
+
+
+@contextmanager
+def _note_that_cannot_be_written(note: Path, kind: str) -> Iterator[None]:
+    """Let the next entry not be noted next to the audit log."""
+    if kind == "immutable":
+        with file_mark(note, IMMUTABLE):
+            yield
+        return
+    note.unlink()
+    if kind == "folder":
+        note.mkdir()
+    elif kind == "pipe":
+        os.mkfifo(note)
+    else:
+        note.symlink_to("elsewhere")
+    yield
+
+
+def _write_as_shown(
+    verb: list[str],
+    capsys: pytest.CaptureFixture[str],
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """Make the change that a verb shows in its dry run; of a rollback it has no base."""
+    capsys.readouterr()
+    assert main(verb) == ExitCode.OK
+    shown = re.search(r"--base \S+", capsys.readouterr().out)
+    base = shown[0].split() if shown else []
+    caplog.clear()
+    assert main([*verb, "--yes", *base]) == ExitCode.OK
+
+
+@pytest.mark.parametrize(
+    ("kind", "remedy"),
+    [
+        ("immutable", "marked as immutable or append-only): a missing end"),
+        ("folder", "remove what has its name"),
+        ("pipe", "remove what has its name"),
+        ("link", "remove what has its name"),
+    ],
+)
+def test_an_entry_that_cannot_be_noted_is_said_once_by_each_verb(
+    cell_file: Path,
+    capsys: pytest.CaptureFixture[str],
+    caplog: pytest.LogCaptureFixture,
+    kind: str,
+    remedy: str,
+) -> None:
+    """`rollback` and `apply` said nothing, and neither did `--verify`."""
+    calibration = str(calibration_for(cell_file))
+    _write_as_shown(["apply", str(cell_file), calibration], capsys, caplog)
+    note = head_file(ledger_of(cell_file).audit)
+    verbs = (["rollback", str(cell_file)], ["apply", str(cell_file), calibration])
+    with _note_that_cannot_be_written(note, kind):
+        for verb in verbs:
+            _write_as_shown(verb, capsys, caplog)
+            assert caplog.text.count(f"cannot be noted in {note}") == 1, verb[0]
+            assert remedy in caplog.text
+        capsys.readouterr()
+        assert run_verb("history", cell_file, "--verify") == ExitCode.OK
+        printed = " ".join(capsys.readouterr().out.split())
+        assert "NOT NOTED: the digest of the last entry cannot be noted in" in printed
+        assert "The next entry writes it again" not in printed
 
 
 def test_a_path_that_is_not_utf_8_is_in_the_history(

@@ -174,7 +174,7 @@ def test_the_verb_says_what_it_wrote_and_refuses_what_is_there(
     said = json.loads(capsys.readouterr().out)
     assert said["messages"]["/joint_states"] == ROWS
     assert said["effort"] is False
-    with pytest.raises(UsageError, match="file or folder of that name"):
+    with pytest.raises(UsageError, match="a folder of that name"):
         export_bag(log, out)
     gains = _calibration().gains[::-1]
     for other in (

@@ -177,3 +177,56 @@ def test_the_full_set_comes_back_from_the_file_and_older_files_have_none() -> No
     del older["digests"]["full_parameters"]
     encoded_text = yaml.safe_dump(older).encode()
     assert decode_calibration(encoded_text, "calibration.yaml").full_parameters is None
+
+
+@pytest.fixture
+def without_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A fit that fails the test: what is refused must be refused before it."""
+
+    def no_fit(*_: object, **__: object) -> None:
+        pytest.fail("the fit has begun")
+
+    monkeypatch.setattr("daq.workflow.fit.fit", no_fit)
+    monkeypatch.setattr("daq.workflow.cases.reduce_logs", no_fit)
+
+
+@pytest.mark.usefixtures("without_fit")
+@pytest.mark.parametrize("by", ["log", "cell"])
+def test_a_prior_of_another_robot_is_refused_before_the_fit(
+    by: str,
+    real: tuple[Path, Path],
+    checkout: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    _, log = real
+    prior = checkout / "configs" / "robots" / "gantry.urdf"
+    out = tmp_path / "calibration.yaml"
+    options: list[object] = ["--prior", prior, "--out", out]
+    if by == "cell":
+        options += ["--cell", checkout / "configs" / "cells" / "tx40.yaml"]
+    assert _fit(log, *options) == ExitCode.CONFIGURATION
+    assert "another robot: 5 moving joints" in capsys.readouterr().err
+    assert not out.exists()
+
+
+@pytest.mark.usefixtures("without_fit")
+def test_a_prior_without_inertias_is_refused_before_the_fit(
+    real: tuple[Path, Path], urdf: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    _, log = real
+    prior = tmp_path / "bare.urdf"
+    bare = re.sub(r"(?s)<inertial>.*?</inertial>", "", urdf)
+    prior.write_text(bare, encoding="utf-8")
+    assert _fit(log, "--prior", prior, "--known", "cad") == ExitCode.USAGE
+    assert "no possible inertia for the links of J1, J2" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("without_fit")
+def test_an_estimator_without_sigma_by_moves_is_refused_before_the_fit(
+    real: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    _, log = real
+    arguments = ["fit", str(log), "--method", "wls", "--prior-tolerance", "0.1"]
+    assert main(arguments) == ExitCode.USAGE
+    assert "expected: ml, whose σ comes from leaving out moves" in capsys.readouterr().err
