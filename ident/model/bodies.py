@@ -55,6 +55,9 @@ class Payload:
     mass_tolerance_kg: float = 0.0
 
     def __post_init__(self) -> None:
+        written = "write Payload('disc', 'flange', {'m': 4.59})"
+        require_kind("name of a payload", self.name, str, written)
+        require_kind(f"mounting of payload {self.name!r}", self.mounting, str, written)
         require_kind("known", self.known, dict, "write its mass as {'m': 4.59}")
         for name, value in self.known.items():
             remedy = "give numbers in SI units: {'m': 4.59}"
@@ -72,6 +75,9 @@ class Payload:
         require_kind(
             "mass_tolerance_kg", self.mass_tolerance_kg, Real, "give kilograms, such as 0.01"
         )
+        if isinstance(self.mass_tolerance_kg, bool):
+            found = f"mass_tolerance_kg is {self.mass_tolerance_kg}"
+            raise ModelError(f"{found}; expected a number; give kilograms, such as 0.01")
         if not 0.0 <= self.mass_tolerance_kg < inf:
             found = f"a mass tolerance of {self.mass_tolerance_kg:g} kg"
             raise ModelError(
@@ -79,7 +85,7 @@ class Payload:
             )
         not_finite: list[str] = []
         for name, value in self.known.items():
-            if not isfinite(value):
+            if not _is_finite(value):
                 not_finite.append(f"{name} = {value}")
         if not_finite:
             found = ", ".join(not_finite)
@@ -101,6 +107,14 @@ class Payload:
         """χ_kL in the order of LINK_PARAMETERS, zero where unknown, shape (10,)."""
         values = [self.known.get(name, 0.0) for name in LINK_PARAMETERS]
         return np.array(values)
+
+
+def _is_finite(value: float) -> bool:
+    """Whether a number is finite as a float; a whole number of 309 digits is not."""
+    try:
+        return isfinite(value)
+    except OverflowError:
+        return False
 
 
 def _require_possible_inertia(payload: Payload) -> None:
