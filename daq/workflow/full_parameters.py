@@ -42,12 +42,14 @@ def full_set(fitted: Fit, urdf: str, name: str, tolerance: float) -> FullSet:
         tolerance: one relative standard deviation of masses and second moments.
 
     Raises:
-        UsageError: the robot has a closed chain, the URDF has no inertia for one of its links, or
-            the gains are by an estimator whose σ takes neighbouring rows for independent.
+        UsageError: the robot has a closed chain or joints that follow others, the URDF has no
+            inertia for one of its links, or the gains are by an estimator whose σ takes
+            neighbouring rows for independent.
         ConfigurationInconsistent: the URDF is of another robot.
         NotPhysical: no possible robot was found.
     """
     cell = fitted.cell
+    _require_serial(cell)
     links = _links_of(cell, fitted.identification.model.robot.joints, urdf, name)
     prior = LinkPrior(links, tolerance)
     final = fitted.final
@@ -87,6 +89,30 @@ def full_set(fitted: Fit, urdf: str, name: str, tolerance: float) -> FullSet:
         mass_ratio=check.mass_ratio if is_mass_seen else None,
         mass_ratio_std=check.mass_ratio_std if is_mass_seen else None,
         contradictions=tuple(contradictions(check, joints)),
+    )
+
+
+def _require_serial(cell: Cell) -> None:
+    """Refuse a robot with joints that have no motor, and name them.
+
+    Raises:
+        UsageError: it has some.
+    """
+    if cell.chain is None:
+        return
+    without_motor = [
+        joint.name for joint in read_urdf(cell.urdf).joints if joint.name not in cell.chain.motors
+    ]
+    names = ", ".join(without_motor)
+    kind = "joints that follow others in the URDF"
+    if cell.chain.closures:
+        kind = "joints of a closed chain without a motor"
+    raise UsageError(
+        "--prior",
+        found=f"{kind}: {names}",
+        expected="a serial robot, each joint with a motor: of links that move together, the "
+        "torques do not show which of them is heavy",
+        remedy="fit without --prior and --prior-tolerance: gains and base parameters need no prior",
     )
 
 
