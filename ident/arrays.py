@@ -42,7 +42,7 @@ def as_array(
         require_real(label, values, refuse, str(shape or "real numbers"))
     try:
         array = np.asarray(values, dtype=np.float64)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         expected = shape or "numbers"
         raise refuse(f"{label} is no array of numbers: {error}; expected {expected}") from error
     if shape and array.shape != shape:
@@ -107,6 +107,22 @@ def require_kind(label: str, value: object, kind: type, remedy: str) -> None:
         raise ModelError(f"{label} is of type {found}; expected {expected}; {remedy}")
 
 
+def require_flag(label: str, value: object) -> None:
+    """Refuse what is neither True nor False, as a `ModelError`: a text would count as True."""
+    if not isinstance(value, (bool, np.bool_)):
+        found = type(value).__name__
+        raise ModelError(f"{label} is of type {found}; expected bool; give True or False")
+
+
+def require_progress(progress: object) -> None:
+    """Refuse what cannot be called with the text of a step, as a `ModelError`."""
+    if not callable(progress):
+        found = type(progress).__name__
+        raise ModelError(
+            f"progress is of type {found}; expected a function of one text; write progress=print"
+        )
+
+
 def require_names(label: str, names: object, count: int | None = None) -> None:
     """Refuse what is no list of names, one an axis where a count is given, as a `ModelError`.
 
@@ -131,6 +147,9 @@ def require_names(label: str, names: object, count: int | None = None) -> None:
 def require_entries(label: str, values: object, kind: type, remedy: str) -> None:
     """Refuse a list with entries of another type, as a `ModelError`; iterators are not read."""
     require_kind(label, values, Iterable, remedy)
+    if isinstance(values, (str, Mapping)):  # which would count as their letters or keys
+        found = type(values).__name__
+        raise ModelError(f"{label} is of type {found}; expected a list; {remedy}")
     if isinstance(values, (Sequence, np.ndarray)):
         entry = f"an entry of {label}"
         for value in values:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ident.arrays import FloatArray, as_array, require_kind, require_names, takes
+from ident.arrays import FloatArray, as_array, require_entries, require_kind, require_names, takes
 from ident.data.conditioning import Conditioning
 from ident.data.run import Recording
 from ident.errors import Diagnosis, ModelError
@@ -404,6 +404,9 @@ def calibration_of(
     last: Evidence | None = None
     start = found
     if steps:
+        from ident.discovery.loop import Step as StepKind  # noqa: PLC0415
+
+        require_entries("steps", steps, StepKind, "give the result of ident.find_effects")
         last = steps[-1].after
         found = last.identification
     system = found.system

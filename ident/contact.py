@@ -41,13 +41,22 @@ import numpy as np
 from scipy.optimize import nnls
 from scipy.special import gammaincinv
 
-from ident.arrays import BoolArray, FloatArray, IntArray, require_kind, require_number, takes
+from ident.arrays import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    as_array,
+    require_kind,
+    require_number,
+    require_real,
+    takes,
+)
 from ident.calibration import Calibration
 from ident.data.conditioning import Conditioning, as_recorded
 from ident.data.dataset import differentiate
 from ident.data.run import Run
 from ident.equations.rows import row_filter, row_masks
-from ident.errors import DataUnfit
+from ident.errors import DataUnfit, ModelError
 from ident.model.model import Model
 from ident.prediction import measured_torque, predict_torque
 
@@ -183,6 +192,8 @@ def external_torque(
     if band is None:
         quiet, left_out = _quiet(residual)
         band = _band([quiet], ALARMS_PER_HOUR)
+    else:
+        _require_band(band, model.robot.axis_count)
     return ExternalTorque(
         time_s=residual.time_s,
         torque_nm=residual.torque_nm,
@@ -192,6 +203,28 @@ def external_torque(
         from_itself=from_itself,
         left_out=left_out,
     )
+
+
+def _require_band(band: Band, count: int) -> None:
+    """Refuse a band of another robot, or with numbers of another shape.
+
+    Raises:
+        ModelError: it is not one of so many joints.
+    """
+    expected = {
+        "scale": (count, 4),
+        "factor": (count,),
+        "threshold": (count,),
+        "correlation_s": (count,),
+    }
+    for name, shape in expected.items():
+        label = f"{name} of the band"
+        values = getattr(band, name)
+        if name == "threshold":  # NaN where the quiet motion has too few peaks
+            require_real(label, values, ModelError)
+            values = np.nan_to_num(values)
+        remedy = "one row per joint: make it with `prediction_band` and the model of this robot"
+        as_array(label, values, shape, remedy)
 
 
 @takes(calibration=Calibration, model=Model, quiet=Iterable, conditioning=Conditioning | None)

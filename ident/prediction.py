@@ -8,16 +8,27 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ident.arrays import LARGEST_NUMBER, FloatArray, as_array, require_size, takes
-from ident.calibration import EXTRAPOLATED, AcceptedEffect, Calibration, Parameter
+from ident.arrays import (
+    LARGEST_NUMBER,
+    FloatArray,
+    as_array,
+    require_entries,
+    require_kind,
+    require_number,
+    require_size,
+    takes,
+)
+from ident.calibration import EXTRAPOLATED, AcceptedEffect, Calibration, Gain, Parameter
 from ident.data.dataset import Dataset
 from ident.effects.effect import (
     ALL_AXES,
     Effect,
+    EffectKey,
     PlacedEffect,
     at_joints,
     check_settings,
     columns_at,
+    effect_key,
     setting_kind,
 )
 from ident.effects.geometry_corrections import (
@@ -41,6 +52,8 @@ from ident.model.model import Model, without_preload
 from ident.model.robot import Motion
 from ident.model.same_robot import foreign_base_parameter
 
+#: What to do about a calibration whose parts are none
+FROM_CALIBRATION = "take it from `calibration_of` or `load_calibration`"
 SAME_MASS = 0.01  #: Share by which two weighings of one body may differ
 
 
@@ -65,6 +78,7 @@ def predict_torque(calibration: Calibration, model: Model, data: Dataset) -> Flo
             mounting, or knows the payload with another mass.
         EffectRefused: it holds an effect that does not exist.
     """
+    _require_motion(data)
     gains = _gains(calibration, model)
     corrections = corrections_of(calibration)
     model = fitted_model(calibration, model)
@@ -73,7 +87,7 @@ def predict_torque(calibration: Calibration, model: Model, data: Dataset) -> Flo
     standard = model.with_payload(standard_parameters(calibration, model), body)
     run = declared_signals(model, data, standard, gains, calibration.session_began_s)
     torque = model.drive_train.direction.T @ run.motor_torque_nm
-    effects = [placed_effect(accepted, calibration) for accepted in calibration.effects]
+    effects = placed_effects(calibration)
     run = beside_rotors(run, (placed for placed, _ in effects))
     for accepted, (placed, coefficients) in zip(calibration.effects, effects, strict=True):
         if is_correction(placed):
@@ -86,6 +100,17 @@ def predict_torque(calibration: Calibration, model: Model, data: Dataset) -> Flo
     if calibration.effects and model.is_redundant:
         torque = without_preload(model.follow(data.motion()), torque)
     return np.asarray(torque.T)
+
+
+def _require_motion(data: Dataset) -> None:
+    """Refuse data whose motion or payload is of another type, as a `ModelError`."""
+    remedy = "make it with `planned` or `differentiate`"
+    for name in ("position_rad", "velocity_rad_s", "acceleration_rad_s2", "time_s"):
+        require_kind(f"{name} of the data", getattr(data, name), np.ndarray, remedy)
+    if data.temperature_c is not None:
+        require_kind("temperature_c of the data", data.temperature_c, np.ndarray, remedy)
+    if data.payload is not None:
+        require_kind("payload of the data", data.payload, Payload, "write Payload(name, mounting)")
 
 
 def fitted_model(calibration: Calibration, model: Model) -> Model:
@@ -109,8 +134,7 @@ def corrections_of(calibration: Calibration) -> tuple[PlacedEffect, ...]:
         EffectRefused: it holds an effect that does not exist.
     """
     found: list[PlacedEffect] = []
-    for accepted in calibration.effects:
-        placed, coefficients = placed_effect(accepted, calibration)
+    for placed, coefficients in placed_effects(calibration):
         if isinstance(placed.effect, GeometryEffect):
             applied = placed.effect.with_applied(coefficients.tolist())
             found.append(replace(placed, effect=applied))
@@ -337,6 +361,29 @@ def _require_same_body(calibration: Calibration, payload: Payload, run: str) -> 
         )
 
 
+def placed_effects(calibration: Calibration) -> list[tuple[PlacedEffect, FloatArray]]:
+    """Effects of a calibration, in its order, each with its coefficients, shape (p,).
+
+    Raises:
+        EffectNotInstalled, EffectRefused: see `placed_effect`; or one is there twice, so that its
+            torque would count twice.
+    """
+    effects: list[tuple[PlacedEffect, FloatArray]] = []
+    keys: set[EffectKey] = set()
+    for accepted in calibration.effects:
+        placed, coefficients = placed_effect(accepted, calibration)
+        key = effect_key(placed.effect, placed.axis)
+        if key in keys:
+            name = placed.name_among(calibration.places)
+            raise EffectRefused(
+                f"found the effect {name} twice in the calibration of cell {calibration.cell!r}; "
+                "expected each effect once on an axis; take one of them out, or fit the logs again"
+            )
+        keys.add(key)
+        effects.append((placed, coefficients))
+    return effects
+
+
 def placed_effect(
     accepted: AcceptedEffect, calibration: Calibration
 ) -> tuple[PlacedEffect, FloatArray]:
@@ -443,11 +490,23 @@ def _coefficients_of(accepted: AcceptedEffect, placed: PlacedEffect) -> FloatArr
 
 def _gains(calibration: Calibration, model: Model) -> FloatArray:
     count = model.robot.axis_count
+    require_entries("gains of the calibration", calibration.gains, Gain, FROM_CALIBRATION)
+    require_entries(
+        "parameters of the calibration", calibration.parameters, Parameter, FROM_CALIBRATION
+    )
+    require_entries(
+        "effects of the calibration", calibration.effects, AcceptedEffect, FROM_CALIBRATION
+    )
+    for parameter in calibration.parameters:
+        require_kind("name of a parameter", parameter.name, str, FROM_CALIBRATION)
+        label = f"parameter {parameter.name!r} of the calibration"
+        require_number(label, parameter.value, remedy=FROM_CALIBRATION)
     gains = [gain.value for gain in calibration.gains]
     if len(gains) != count:
         raise ModelError(f"the calibration has {len(gains)} gains, the model {count} joints")
+    found = as_array("gains of the calibration", gains, (count,), "one per axis")
     _require_numbers(calibration)
-    return np.array(gains)
+    return found
 
 
 def _require_numbers(calibration: Calibration) -> None:

@@ -47,7 +47,7 @@ from ident.model.model import Column, Model
 from ident.model.robot import Place
 from ident.planning.excitation import UNSEEN, side_of_cube
 from ident.planning.gain_verdict import ExtraMoves
-from ident.prediction import corrections_of, left_of, placed_effect, standard_parameters
+from ident.prediction import corrections_of, left_of, placed_effects, standard_parameters
 
 MAX_PASSES = 8  #: Of the effects' columns; load friction of a tenth of the load needs three
 #: Largest change of the body in the last pass, as a share of its size; each is some 3 % of the one
@@ -437,8 +437,8 @@ def weigh_rows(calibration: Calibration, given: RowsToWeigh) -> WeighedBody:
 def _robot_of(calibration: Calibration, model: Model) -> _CalibratedValues:
     effects: list[PlacedEffect] = []
     coefficients: list[FloatArray] = []
-    for accepted in calibration.effects:
-        placed, values = left_of(*placed_effect(accepted, calibration))
+    for fitted, fitted_values in placed_effects(calibration):
+        placed, values = left_of(fitted, fitted_values)
         effects.append(placed)
         coefficients.append(values)
     gains = [gain.value for gain in calibration.gains]

@@ -25,7 +25,6 @@ from ident.physical.full_parameters import (
     FullParameters,
     LinkPrior,
     full_parameters,
-    require_serial,
 )
 from ident.physical.full_set import FullParameter, FullSet, GainWithPrior
 from ident.physical.prior_check import PriorCheck
@@ -47,12 +46,14 @@ def full_set(fitted: Fit, urdf: str, name: str, tolerance: float) -> FullSet:
         tolerance: one relative standard deviation of masses and second moments.
 
     Raises:
-        UsageError: the robot has a closed chain, the URDF has no inertia for one of its links, or
-            the gains are by an estimator whose σ takes neighbouring rows for independent.
+        UsageError: the robot has a closed chain or joints that follow others, the URDF has no
+            inertia for one of its links, or the gains are by an estimator whose σ takes
+            neighbouring rows for independent.
         ConfigurationInconsistent: the URDF is of another robot.
         NotPhysical: no possible robot was found.
     """
     cell = fitted.cell
+    _require_serial(cell)
     links = _links_of(cell, fitted.identification.model.robot, urdf, name)
     prior = LinkPrior(links, tolerance)
     final = fitted.final
@@ -103,12 +104,8 @@ def require_prior(cell: Cell, urdf: str, name: str) -> None:
         ConfigurationInconsistent: the URDF is of another robot.
         ModelError: the cell describes no robot.
     """
-    robot = model_of(cell).robot
-    _links_of(cell, robot, urdf, name)
-    try:
-        require_serial(robot)
-    except ModelError as error:
-        raise _unfit_robot(error) from error
+    _require_serial(cell)
+    _links_of(cell, model_of(cell).robot, urdf, name)
 
 
 def _unfit_robot(error: ModelError) -> UsageError:
@@ -138,6 +135,30 @@ def require_std_by_moves(method: Method | None, *, gains_fixed: bool) -> None:
         found="--prior or --prior-tolerance with it",
         expected=f"{Method.ML.value}, whose σ comes from leaving out moves",
         remedy="leave out --method",
+    )
+
+
+def _require_serial(cell: Cell) -> None:
+    """Refuse a robot with joints that have no motor, and name them.
+
+    Raises:
+        UsageError: it has some.
+    """
+    if cell.chain is None:
+        return
+    without_motor = [
+        joint.name for joint in read_urdf(cell.urdf).joints if joint.name not in cell.chain.motors
+    ]
+    names = ", ".join(without_motor)
+    kind = "joints that follow others in the URDF"
+    if cell.chain.closures:
+        kind = "joints of a closed chain without a motor"
+    raise UsageError(
+        "--prior",
+        found=f"{kind}: {names}",
+        expected="a serial robot, each joint with a motor: of links that move together, the "
+        "torques do not show which of them is heavy",
+        remedy="fit without --prior and --prior-tolerance: gains and base parameters need no prior",
     )
 
 

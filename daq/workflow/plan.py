@@ -22,7 +22,7 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from daq.config.cell import DEGREE, Cell, JointUnit, model_of
+from daq.config.cell import DEGREE, Cell, JointUnit, joint_unit, model_of, robot_of
 from daq.config.same_cell import (
     calibrated_robot,
     expected_text,
@@ -60,6 +60,7 @@ from ident.planning.clearance import CLOSURES, WORKSPACE_END, Checker, Obstructi
 from ident.planning.effort import EFFORT_MARGIN
 from ident.planning.excitation import Design
 from ident.planning.gain_verdict import verdicts
+from ident.planning.limits import followers_beyond
 from ident.plausible import format_at_limit
 
 
@@ -683,7 +684,8 @@ def plan(
     Raises:
         PlanTooShort: a longer plan would show every gain, or have room for enough moves.
         UsageError: no plan shows every gain, or there is no clear way.
-        ConfigurationInconsistent: the cell declares no payload.
+        ConfigurationInconsistent: the cell declares no payload, or a joint that follows an axis
+            would go beyond its own limits.
     """
     experiment = experiment or experiment_of(cell)
     if largest_condition is None:
@@ -694,6 +696,7 @@ def plan(
     goal = goal or PlanGoal.of_first(experiment.design)
     targets = _targets(cell, duration_s, box)
     allowed = _allowed_targets(cell, box)
+    _require_followers(cell, allowed)
     if acceleration is None:
         acceleration = speed
     search = Search(
@@ -865,6 +868,32 @@ def _allowed_targets(cell: Cell, box: TargetBox | None) -> TargetBox:
     lower = np.maximum(limits.lower, box.lower - rounding)
     upper = np.minimum(limits.upper, box.upper + rounding)
     return TargetBox(lower, upper)
+
+
+def _require_followers(cell: Cell, targets: TargetBox) -> None:
+    """Refuse targets between which a joint that follows an axis goes beyond its own limits.
+
+    Raises:
+        ConfigurationInconsistent: for the first such joint.
+    """
+    for beyond in followers_beyond(robot_of(cell), targets.lower, targets.upper):
+        axis = cell.axes[beyond.axis]
+        joint = beyond.joint
+        unit = joint_unit(joint.kind)
+        allowed = _interval(axis.unit, beyond.axis_range)
+        raise ConfigurationInconsistent(
+            f"cell {cell.name}, limits of {axis.name}",
+            found=f"joint {joint.name}, which follows it, from {_interval(unit, beyond.reached)}",
+            expected=f"{_interval(unit, joint.range or beyond.reached)}, its limits in the URDF",
+            remedy=f"give {axis.name} `limits` within {allowed}, or correct <limit> or <mimic> of "
+            f"{joint.name} in the URDF",
+        )
+
+
+def _interval(unit: JointUnit, ends: tuple[float, float]) -> str:
+    """Format two positions that are given in SI: `-20 deg to 35.5 deg`."""
+    first, last = ends
+    return f"{unit.spell(first)} to {unit.spell(last)}"
 
 
 def slowed(cell: Cell, plan_: Plan, override: float) -> Plan:
@@ -1066,8 +1095,9 @@ def load_plan(path: Path, cell: Cell) -> Plan:
 
     Raises:
         ConfigurationError: the file is missing, is not what its schema says, a target lies outside
-            the joint limits, the plan takes longer than an hour, a way leaves the declared
-            workspace or clearance, or the plan was made for another robot with the same cell name.
+            the joint limits or those of a joint that follows an axis, the plan takes longer than
+            an hour, a way leaves the declared workspace or clearance, or the plan was made for
+            another robot with the same cell name.
     """
     model = read_model(parse_yaml(read_yaml_bytes(path), str(path)), _Plan)
     if model.cell != cell.name:
@@ -1083,6 +1113,7 @@ def load_plan(path: Path, cell: Cell) -> Plan:
     moves = tuple(
         _planned_move(path, cell, number, move) for number, move in enumerate(model.moves)
     )
+    _check_followers(path, cell, moves)
     duration_s = experiment_duration_s(cell, moves)
     if duration_s > LONGEST_S:
         found = f"{duration_s:.0f} s of moves and dwells"
@@ -1167,6 +1198,27 @@ def _planned_move(path: Path, cell: Cell, number: int, move: _Move) -> PlannedMo
             remedy = "correct the move, or the limits if they are wrong"
             raise _refused(f"{where}, {axis.name}", spell(position), expected, remedy)
     return PlannedMove(target, move.velocity, move.acceleration, move.dwell_s)
+
+
+def _check_followers(path: Path, cell: Cell, moves: tuple[PlannedMove, ...]) -> None:
+    """Refuse targets at which a joint that follows an axis is beyond its own limits."""
+    robot = robot_of(cell)
+    if not robot.couplings:
+        return
+    for number, move in enumerate(moves):
+        target = np.array(move.target_rad)
+        for beyond in followers_beyond(robot, target, target):
+            axis = cell.axes[beyond.axis]
+            joint = beyond.joint
+            unit = joint_unit(joint.kind)
+            position, _ = beyond.reached
+            limits = _interval(unit, joint.range or beyond.reached)
+            raise _refused(
+                f"{path}: moves[{number}], {axis.name}",
+                f"joint {joint.name}, which follows it, at {unit.spell(position)}",
+                f"{limits}, its limits in the URDF",
+                f"correct the move: {axis.name} within {_interval(axis.unit, beyond.axis_range)}",
+            )
 
 
 AROUND_SHARE = 0.25

@@ -12,13 +12,20 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from functools import lru_cache
-from math import ceil
+from math import ceil, inf
 from numbers import Real
 from typing import Any, Self
 
 import numpy as np
 
-from ident.arrays import FloatArray, IntArray, require_count, require_kind
+from ident.arrays import (
+    FloatArray,
+    IntArray,
+    Refusal,
+    require_count,
+    require_kind,
+    require_number,
+)
 from ident.errors import ModelError
 
 FILTER_ORDER = (1, 10)  #: Least and largest order of the filter of the positions
@@ -80,6 +87,8 @@ class Conditioning:
         Raises:
             ModelError: a setting is missing, unknown, or no number.
         """
+        remedy = "give what `Conditioning.document` returns"
+        require_kind("the filter of the calibration", document, Mapping, remedy)
         expected = asdict(cls())
         found: dict[str, Any] = dict(document)
         for name in CURRENT_FILTER:
@@ -126,9 +135,50 @@ def require_settings(conditioning: Conditioning) -> None:
     }
     for name, value in numbers.items():
         require_kind(f"{name} of the conditioning", value, Real, "give a number")
+        if isinstance(value, bool):
+            raise ModelError(
+                f"{name} of the conditioning is {value}; expected a number; leave it out if "
+                "you do not know it"
+            )
+    if not 0.0 <= conditioning.standstill_share <= 1.0:
+        raise ModelError(
+            f"standstill_share of the conditioning is {conditioning.standstill_share:g}; expected "
+            "0 to 1; 0.1 is usual"
+        )
+    _require_speeds(conditioning.standstill_rad_s)
     least, largest = FILTER_ORDER
     _require_order("position_order", conditioning.position_order, least, largest)
     _require_order("current_order", conditioning.current_order, 0, largest)
+
+
+def require_cutoffs(conditioning: Conditioning, refuse: Refusal = ModelError) -> None:
+    """Refuse cut-offs that no filter has at any sampling rate.
+
+    Raises:
+        Exception: made by ``refuse``, where one is not above 0 Hz.
+    """
+    cutoffs_hz = [conditioning.position_cutoff_hz, conditioning.decimation_cutoff_hz]
+    if conditioning.current_cutoff_hz != 0.0:
+        cutoffs_hz.append(conditioning.current_cutoff_hz)
+    for cutoff_hz in cutoffs_hz:
+        if not 0.0 < cutoff_hz < inf:  # nor is NaN
+            raise refuse(
+                f"filtered with a cut-off of {cutoff_hz:g} Hz; expected above 0 Hz, and finite: "
+                "see Conditioning"
+            )
+
+
+def _require_speeds(speeds: object) -> None:
+    """Refuse standstill speeds that are no tuple or list of numbers, zero or above."""
+    label = "standstill_rad_s of the conditioning"
+    remedy = "give one a joint, (0.03, 0.03), or leave it out"
+    if not isinstance(speeds, (tuple, list)):
+        found = type(speeds).__name__
+        raise ModelError(f"{label} is of type {found}; expected a tuple of numbers; {remedy}")
+    for number, speed in enumerate(speeds, start=1):
+        entry = require_number(f"entry {number} of {label}", speed, remedy=remedy)
+        if entry < 0.0:
+            raise ModelError(f"entry {number} of {label} is {entry:g}; expected 0 or more")
 
 
 def _require_order(name: str, value: object, least: int, largest: int) -> None:

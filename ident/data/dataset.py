@@ -33,6 +33,7 @@ from ident.data.conditioning import (
     Conditioning,
     central_differences,
     low_pass,
+    require_cutoffs,
     require_settings,
 )
 from ident.data.held import HeldChannels, fill_held
@@ -435,6 +436,7 @@ def _check(run: Run, count: int, conditioning: Conditioning, refuse: Refusal) ->
         DataUnfit: as of `differentiate`.
     """
     require_settings(conditioning)
+    require_cutoffs(conditioning, refuse)
     samples = len(run.time_s)
     speeds = len(conditioning.standstill_rad_s)
     if speeds not in (0, count):
@@ -461,11 +463,6 @@ def _check(run: Run, count: int, conditioning: Conditioning, refuse: Refusal) ->
     }
     if conditioning.current_cutoff_hz:
         cutoffs_hz["current"] = conditioning.current_cutoff_hz
-    lowest = min(cutoffs_hz.values())
-    if not lowest > 0.0:
-        raise refuse(
-            f"filtered with a cut-off of {lowest:g} Hz; expected above 0 Hz: see Conditioning"
-        )
     name, highest = max(cutoffs_hz.items(), key=lambda item: item[1])
     least_rate_hz = 2.5 * highest
     if not run.rate_hz > least_rate_hz:

@@ -9,7 +9,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ident.arrays import BoolArray, FloatArray, IntArray, require_kind, require_number
+from ident.arrays import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    require_entries,
+    require_flag,
+    require_kind,
+    require_number,
+)
 from ident.data.channel_faults import JudgedChannels
 from ident.data.conditioning import Conditioning
 from ident.data.torque_channel import TorqueChannel
@@ -106,13 +114,27 @@ class Run:
 
 
 def require_named(run: Run) -> None:
-    """Refuse a run whose name is no text, or whose beginning is no time, before a message or a
-    report uses them.
+    """Refuse a run with a field of another type that is no array, before a message or a report
+    uses it.
 
     Raises:
-        ModelError: for either.
+        ModelError: for the field.
     """
     require_kind("name of a run", run.name, str, "write Run('bare', time_s, ...)")
+    of_run = f"of {run.name!r}"
+    if run.payload is not None:
+        remedy = "write Payload(name, mounting, known)"
+        require_kind(f"payload {of_run}", run.payload, Payload, remedy)
+    require_kind(f"digest {of_run}", run.digest, str, "leave it out of a run that is of no log")
+    require_flag(f"partial {of_run}", run.partial)
+    if run.recording is not None:
+        remedy = "leave it out of a run that is of no log"
+        require_kind(f"recording {of_run}", run.recording, Recording, remedy)
+    remedy = "give a list of them, or leave it out"
+    require_entries(f"torque_channels {of_run}", run.torque_channels, TorqueChannel, remedy)
+    if run.judged_channels is not None:
+        remedy = "leave it out of a run that is of no log"
+        require_kind(f"judged_channels {of_run}", run.judged_channels, JudgedChannels, remedy)
     if run.started_s is not None:
         remedy = "leave it out without a clock that the runs share"
         require_number(f"started_s of {run.name!r}", run.started_s, remedy=remedy)
@@ -127,7 +149,7 @@ def usual_conditioning(runs: Iterable[Run]) -> Conditioning:
     for run in runs:
         try:
             time_s = np.asarray(run.time_s, dtype=np.float64)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             continue
         if time_s.ndim == 1 and len(time_s) > 1 and 0.0 < time_s[-1] - time_s[0] < np.inf:
             rates_hz.append(float((len(time_s) - 1) / (time_s[-1] - time_s[0])))

@@ -27,12 +27,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from ident.arrays import takes
+from ident.arrays import require_entries, require_flag, require_progress, takes
 from ident.discovery.before_after import compare_on_holdout, error_on
 from ident.discovery.candidates import ColumnCache
 from ident.discovery.effect_verdict import EffectVerdict, Judgement, judge_change
 from ident.discovery.evidence import Evidence, place_names, with_effects
-from ident.discovery.gates import Gates
+from ident.discovery.gates import Gates, require_gates
 from ident.discovery.joining import UNFITTED, JointFit, linearised
 from ident.discovery.loop import Step, end_search
 from ident.effects.effect import PlacedEffect
@@ -41,7 +41,13 @@ from ident.estimators.estimate import RelativeError
 from ident.estimators.identify import estimate_with
 
 
-@takes(start=Evidence, steps=Sequence, gates=Gates | None, rng=np.random.Generator | None)
+@takes(
+    start=Evidence,
+    steps=Sequence,
+    gates=Gates | None,
+    rng=np.random.Generator | None,
+    axes=Sequence,
+)
 def accept_on_holdout(
     start: Evidence,
     steps: Sequence[Step],
@@ -74,12 +80,17 @@ def accept_on_holdout(
     Raises:
         NotConverged, RankDeficient: see `ident.identify`.
     """
+    require_entries("steps", steps, Step, "give the result of ident.find_effects")
+    require_progress(progress)
+    require_flag("write_undecided", write_undecided)
+    gates = gates or Gates()
+    require_gates(gates)
+    names = place_names(start.model, axes)
     if not steps or start.holdout is None:
         return tuple(steps)
     found = steps[-1].after
     if len(found.effects) == found.declared:
         return tuple(steps)
-    names = place_names(start.model, axes)
     verdicts: dict[PlacedEffect, EffectVerdict] = {}
     bootstrap = rng or np.random.default_rng(0)
     last = steps[-1]
@@ -96,7 +107,7 @@ def accept_on_holdout(
         if kept.effects != last.after.effects:
             undecided = _undecided(found, kept, verdicts)
             model = _fitted_again(start, found, kept)
-            last = _ended_again(steps, last, model, gates or Gates(), bootstrap, undecided)
+            last = _ended_again(steps, last, model, gates, bootstrap, undecided)
         # What no longer passes in this fit has left: the effects beside it are judged again.
         is_pruned = len(last.after.effects) < len(kept.effects)
         if not is_pruned:

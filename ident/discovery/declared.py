@@ -65,7 +65,10 @@ def with_declared(
         finding = _finding_beside_others(model, evidence.effects[-1], rng, gates)
         if finding is None:
             name = placed.name_among(names)
-            raise EffectRefused(f"the declared {name}: the model contains it already")
+            raise EffectRefused(
+                f"the declared {name}: found it in the model already; expected each effect once on "
+                "an axis; declare it once"
+            )
         limits_nm = detection_limits_nm(model.search_problem, gates)
         steps.append(Step((), (), limits_nm, finding, evidence, declared=True))
     wrong = impossible_declared(evidence, names)

@@ -15,18 +15,19 @@ derivative to a gain is the torque of its motor, so it changes with Φ c too.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import scipy  # loads scipy.special when it is first used: a fit needs none of it
 from scipy import linalg
 
-from ident.arrays import BoolArray, FloatArray, IntArray
+from ident.arrays import BoolArray, FloatArray, IntArray, require_count, require_number
 from ident.discovery.candidates import UNSEEN, SearchProblem
 from ident.discovery.error_change import ErrorChange, change_of_errors
 from ident.effects.effect import Effect, PlacedEffect
 from ident.equations.linearisation import RIDGE, Folds, cut_into_folds, sum_of_squares
 from ident.equations.observation import Observation
+from ident.errors import ModelError
 from ident.estimators.estimate import Estimate
 from ident.model.model import Column
 
@@ -68,6 +69,26 @@ class Gates:
         """
         smallest_fall = 1.0 - (1.0 - self.error_fall) ** 2
         return max(self.explained, smallest_fall)
+
+
+def require_gates(gates: Gates) -> None:
+    """Refuse limits that are no shares, and a number of draws that is none.
+
+    Raises:
+        ModelError: for the limit.
+    """
+    for field in fields(gates):
+        label = f"{field.name} of the gates"
+        value = getattr(gates, field.name)
+        if field.name == "draws":
+            if not require_count(label, value, remedy="999 is usual"):
+                raise ModelError(f"{label} is 0; expected at least 1; 999 is usual")
+            continue
+        share = require_number(label, value, remedy=f"{field.default:g} is usual")
+        if not 0.0 <= share <= 1.0:
+            raise ModelError(
+                f"{label} is {share:g}; expected a share from 0 to 1; {field.default:g} is usual"
+            )
 
 
 def impossible(

@@ -51,9 +51,9 @@ from ident.discovery.gates import (
 from ident.discovery.late_currents import Delay
 from ident.discovery.refinement import refine_together
 from ident.discovery.rotor_search import with_refined_rotor
-from ident.discovery.search import EffectKey, Finding, effect_key, is_better, rank_families
+from ident.discovery.search import Finding, is_better, rank_families
 from ident.discovery.structure import is_inadequate
-from ident.effects.effect import Effect, PlacedEffect, Reported
+from ident.effects.effect import Effect, EffectKey, PlacedEffect, Reported, effect_key
 from ident.effects.friction import PositionFriction, SpeedFriction
 from ident.effects.geometry_corrections import LatePosition, is_correction
 from ident.effects.signals import Abscissa

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ident.arrays import FloatArray, takes
+from ident.arrays import FloatArray, require_entries, require_kind, require_progress, takes
 from ident.discovery.balancer import propose_balancers
 from ident.discovery.cables import propose_cables
 from ident.discovery.candidates import ColumnCache, FamilyTrials, SearchProblem
@@ -26,6 +26,7 @@ from ident.discovery.gates import (
     own_unknowns,
     possible_values,
     probability_of_zero,
+    require_gates,
     values_of,
     whitened_columns,
 )
@@ -48,10 +49,8 @@ from ident.discovery.resonance import gears_around, propose_resonances, refined_
 from ident.discovery.ripple import propose_orders
 from ident.discovery.rotor_search import propose_losses_without_rotor
 from ident.discovery.search import (
-    EffectKey,
     Finding,
     choose_effect,
-    effect_key,
     rank_effects,
     rank_families,
     refine_setting,
@@ -63,7 +62,7 @@ from ident.discovery.structure import (
     is_inadequate,
 )
 from ident.effects.dictionary import GEOMETRY
-from ident.effects.effect import Effect, PlacedEffect
+from ident.effects.effect import Effect, EffectKey, PlacedEffect, effect_key
 from ident.effects.own import families_of, search_families
 from ident.effects.position import Counterbalance
 from ident.effects.transmission import Ripple
@@ -116,7 +115,11 @@ class Step:
 
 
 @takes(
-    start=Evidence, rng=np.random.Generator, gates=Gates | None, axes=Sequence, own_effects=Sequence
+    start=Evidence,
+    rng=np.random.Generator,
+    gates=Gates | None,
+    axes=Sequence,
+    own_effects=Sequence,
 )
 def find_effects(
     start: Evidence,
@@ -195,8 +198,17 @@ def find_effects(
         TooFewMoves: there are too few moves to leave some out.
     """
     gates = gates or Gates()
+    require_gates(gates)
+    if mistakes is not None:
+        remedy = "leave it out: the check is made here then"
+        require_kind("mistakes", mistakes, Sequence, remedy)
+        require_entries("mistakes", mistakes, Finding, remedy)
+    for name, given in {"families": families, "geometry": geometry}.items():
+        if given is not None:
+            _require_families(name, given)
     if progress is None:
         progress = _ignore
+    require_progress(progress)
     if geometry is None:
         geometry = GEOMETRY
     if families is None:
@@ -238,6 +250,15 @@ def find_effects(
     last = end_search(steps, model, gates, rng=rng)
     not_joined = [one for one in aside if one.finding.placed not in last.after.effects]
     return (*steps[:-1], replace(last, set_aside=(*not_joined, *last.set_aside)))
+
+
+def _require_families(name: str, families: object) -> None:
+    """Refuse what is no sequence of families, each a sequence of effects, as a `ModelError`."""
+    remedy = f"leave it out, or write {name}=((effect,),)"
+    require_kind(name, families, Sequence, remedy)
+    require_entries(name, families, Sequence, remedy)
+    for family in families:  # type: ignore[attr-defined]
+        require_entries(f"a family of {name}", family, Effect, remedy)
 
 
 def _corrected(

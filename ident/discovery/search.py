@@ -45,12 +45,17 @@ from ident.discovery.few_moves import (
 )
 from ident.discovery.gates import SIGMAS, Gates, certain_delays, impossible
 from ident.discovery.refinement import refine_together
-from ident.effects.effect import Effect, PlacedEffect, fits_data, is_placeable
+from ident.effects.effect import (
+    Effect,
+    EffectKey,
+    PlacedEffect,
+    effect_key,
+    fits_data,
+    is_placeable,
+)
 from ident.effects.geometry_corrections import GeometryEffect, LatePosition
 from ident.effects.own import search_families
 from ident.effects.position import AlongTwoJoints, Compensator, Counterbalance, Hinge, Spring
-
-EffectKey = tuple[str, int, tuple[float, ...]]
 
 AS_GOOD = 0.99  #: Share of the best one's fall on left-out moves that counts as equal
 CABLE_MORE = 0.15
@@ -255,16 +260,6 @@ def _is_simpler_than_cable(found: Finding, cable: Finding) -> bool:
     if found.axis not in (cable.axis, second_axis):
         return False
     return cable.left_out_fall < (1.0 + CABLE_MORE) * found.left_out_fall
-
-
-def effect_key(effect: Effect, axis: int) -> EffectKey:
-    """Identify an effect on an axis by its family and `Effect.key_settings`.
-
-    Two orders of a ripple are two.
-    """
-    settings = effect.settings
-    key_settings = tuple(settings[name] for name in effect.key_settings)
-    return effect.name, axis, key_settings
 
 
 def _parameter_count(effect: Effect) -> int:

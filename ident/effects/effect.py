@@ -398,6 +398,10 @@ def check_settings(effect: Effect, settings: Mapping[str, float], axis: int, axe
 ALL_AXES = "all axes"  #: Where an effect is that acts on every motor alike
 
 
+#: Family, axis, and the settings in which effects of one family on one axis differ
+EffectKey = tuple[str, int, tuple[float, ...]]
+
+
 @dataclass(frozen=True, slots=True)
 class PlacedEffect:
     """An effect on an axis, or on a joint without a motor."""
@@ -440,6 +444,16 @@ class PlacedEffect:
             name = f"{self.effect.name} {coefficient.name} {suffix}"
             columns.append(replace(coefficient, name=name))
         return tuple(columns)
+
+
+def effect_key(effect: Effect, axis: int) -> EffectKey:
+    """Identify an effect on an axis by its family and `Effect.key_settings`.
+
+    Two orders of a ripple are two.
+    """
+    settings = effect.settings
+    key_settings = tuple(settings[name] for name in effect.key_settings)
+    return effect.name, axis, key_settings
 
 
 def effect_torque(

@@ -13,11 +13,12 @@ from math import ceil
 
 import numpy as np
 
-from ident.arrays import BoolArray, FloatArray, IntArray
+from ident.arrays import BoolArray, FloatArray, IntArray, as_array, require_kind
 from ident.data.conditioning import Conditioning, Decimator, current_rows
 from ident.data.dataset import Dataset, differentiate
 from ident.data.run import Run
 from ident.equations.rows import row_masks
+from ident.errors import ModelError
 from ident.model.model import Model
 from ident.model.robot import Motion
 
@@ -33,6 +34,31 @@ class Instants:
     use: BoolArray  #: rows of each motor that count, shape (m, k)
     move: IntArray  #: number of each row's move within the run, shape (k,)
     mounting: str | None  #: of the payload; None without load
+
+    def require_axes(self, count: int) -> None:
+        """Refuse rows that are not of so many axes, or of several lengths.
+
+        Raises:
+            ModelError: for a field of another type or shape.
+        """
+        remedy = "give `Identification.instants`"
+        require_kind("motion of the instants", self.motion, Motion, remedy)
+        if self.mounting is not None:
+            require_kind("mounting of the instants", self.mounting, str, remedy)
+        position_rad = as_array("position_rad of the instants", self.motion.position_rad)
+        rows = len(np.atleast_1d(position_rad))
+        expected = {
+            "current_a": (self.current_a, (count, rows)),
+            "use": (self.use, (count, rows)),
+            "move": (self.move, (rows,)),
+        }
+        for name, (values, shape) in expected.items():
+            as_array(f"{name} of the instants", values, shape, remedy)
+        if position_rad.shape != (rows, count):
+            raise ModelError(
+                f"position_rad of the instants has shape {position_rad.shape}; expected "
+                f"({rows}, {count}); {remedy}"
+            )
 
     def every(self, step: int) -> Instants:
         """Every so many of the rows."""

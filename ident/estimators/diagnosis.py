@@ -27,6 +27,7 @@ from ident.arrays import (
     as_array,
     require_entries,
     require_names,
+    require_real,
     takes,
 )
 from ident.data.conditioning import Conditioning
@@ -44,7 +45,14 @@ from ident.equations.reduction import motor_support
 from ident.equations.rows import motor_columns, rows_of
 from ident.equations.system import System
 from ident.equations.triangles import qr_update, triangle
-from ident.errors import GAIN_UNSEEN, CurrentUnsigned, DataUnfit, Diagnosis, IdentificationError
+from ident.errors import (
+    GAIN_UNSEEN,
+    CurrentUnsigned,
+    DataUnfit,
+    Diagnosis,
+    IdentificationError,
+    ModelError,
+)
 from ident.estimators.estimate import Estimate, Identification
 from ident.estimators.least_squares import wls
 from ident.estimators.maximum_likelihood import ml
@@ -131,9 +139,25 @@ def diagnose(
     if effort_limit is None:
         limits = None
     else:
-        limits = np.asarray(effort_limit, dtype=np.float64)
+        limits = _effort_limits(effort_limit, len(axes))
     with with_channel_causes(found.channels, axes):
         return tuple(_diagnoses(found, axes, entered_gains, limits))
+
+
+def _effort_limits(effort_limit: ArrayLike, count: int) -> FloatArray:
+    """Return the limits of the joints, shape (m,); refuse what is none, as a `ModelError`."""
+    require_real("effort_limit", effort_limit, ModelError, "one number an axis")
+    limits = np.asarray(effort_limit, dtype=np.float64)
+    if limits.shape != (count,):
+        raise ModelError(
+            f"effort_limit has shape {limits.shape}; expected ({count},), one per axis"
+        )
+    if not np.all(limits >= 0.0):
+        raise ModelError(
+            f"effort_limit is {limits.tolist()}; expected no number below zero; give inf "
+            "where a limit is not known"
+        )
+    return limits
 
 
 TRACES_OF_STILL_JOINTS = {"axis-error", "masses-contradict", "payload-differs"}

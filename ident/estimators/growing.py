@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from ident.data.conditioning import Conditioning
-from ident.data.run import Run
+from ident.arrays import require_entries, require_kind
+from ident.data.conditioning import Conditioning, require_cutoffs, require_settings
+from ident.data.run import Run, require_named
 from ident.equations.joined import join_systems
 from ident.equations.reduction import reduce_built, regrouped
 from ident.equations.system import System
@@ -39,6 +41,7 @@ class GrowingFit:
             run: all its samples.
 
         Raises:
+            ModelError: the fit was begun with an argument of another type, or the run is none.
             DataUnfit: see `ident.data.dataset.differentiate`; or it is in the fit already, or
                 carries a payload that is not among ``payloads``.
         """
@@ -54,11 +57,14 @@ class GrowingFit:
             run: its samples so far, from the first one on.
 
         Raises:
-            DataUnfit: as for `with_run`.
+            ModelError, DataUnfit: as for `with_run`.
         """
         return self._folded(run, is_complete=False)
 
     def _folded(self, run: Run, *, is_complete: bool) -> GrowingFit:
+        self._require_begun()
+        require_kind("run", run, Run, "write Run(name, time_s, position_rad, current_a)")
+        require_named(run)
         before = self._before(run)
         found = new_rows(self.model, run, self.conditioning, before, is_complete=is_complete)
         standard = self.standard
@@ -69,6 +75,21 @@ class GrowingFit:
             standard = new
         others = tuple(other for other in self.runs if other.name != run.name)
         return replace(self, standard=standard, runs=(*others, found.progress))
+
+    def _require_begun(self) -> None:
+        """Refuse a fit that was begun with something of another type, as a `ModelError`."""
+        require_kind("model", self.model, Model, "write Model(robot, drive_train)")
+        require_kind("conditioning", self.conditioning, Conditioning, "write Conditioning()")
+        require_settings(self.conditioning)
+        require_cutoffs(self.conditioning)
+        remedy = "give a tuple of the payloads that will be mounted"
+        require_kind("payloads", self.payloads, Sequence, remedy)
+        require_entries("payloads", self.payloads, Payload, remedy)
+        remedy = "leave it out: a fit has its own"
+        if self.standard is not None:
+            require_kind("standard", self.standard, System, remedy)
+        require_kind("runs", self.runs, tuple, remedy)
+        require_entries("runs", self.runs, RunProgress, remedy)
 
     def _before(self, run: Run) -> RunProgress | None:
         """Return how far a run is folded in, None for a new one; refuse one that may not be."""

@@ -46,7 +46,7 @@ from ident.model.bodies import Payload
 from ident.model.model import Model
 
 
-@takes()
+@takes(method=Method | str, keep_rows=bool, judge=bool)
 def identify(
     model: Model,
     runs: Iterable[Run],
@@ -324,18 +324,11 @@ def each_run(
                 run.name, "found two runs of this name; expected another name for each; rename one"
             )
         names.add((run.name, run.digest))
-        if run.payload is not None:
-            require_kind(
-                f"payload of {run.name!r}",
-                run.payload,
-                Payload,
-                "write Payload(name, mounting, known)",
-            )
-            if payloads is not None:
-                mountings = {known.mounting for known in payloads}
-                if run.payload.mounting not in mountings:
-                    mounting = f"mounting {run.payload.mounting!r}, which no run of the fit carries"
-                    raise DataUnfit(run.name, f"held out with {mounting}: it stays unknown")
+        if run.payload is not None and payloads is not None:
+            mountings = {known.mounting for known in payloads}
+            if run.payload.mounting not in mountings:
+                mounting = f"mounting {run.payload.mounting!r}, which no run of the fit carries"
+                raise DataUnfit(run.name, f"held out with {mounting}: it stays unknown")
         yield run
 
 

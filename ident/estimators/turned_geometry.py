@@ -301,6 +301,8 @@ def find_turned_geometry(
         good as any.
     """
     require_entries("instants", instants, Instants, "give `Identification.instants`")
+    for of_run in instants:
+        of_run.require_axes(model.robot.axis_count)
     if model.is_redundant or not instants:
         return None
     nameplate = as_array("gains", gains, (model.robot.axis_count,), "one per motor")

@@ -55,6 +55,9 @@ class Payload:
     mass_tolerance_kg: float = 0.0
 
     def __post_init__(self) -> None:
+        written = "write Payload('disc', 'flange', {'m': 4.59})"
+        require_kind("name of a payload", self.name, str, written)
+        require_kind(f"mounting of payload {self.name!r}", self.mounting, str, written)
         require_kind("known", self.known, dict, "write its mass as {'m': 4.59}")
         for name, value in self.known.items():
             remedy = "give numbers in SI units: {'m': 4.59}"
@@ -72,6 +75,9 @@ class Payload:
         require_kind(
             "mass_tolerance_kg", self.mass_tolerance_kg, Real, "give kilograms, such as 0.01"
         )
+        if isinstance(self.mass_tolerance_kg, bool):
+            found = f"mass_tolerance_kg is {self.mass_tolerance_kg}"
+            raise ModelError(f"{found}; expected a number; give kilograms, such as 0.01")
         tolerance_kg = as_float(self.mass_tolerance_kg)
         if not 0.0 <= tolerance_kg <= LARGEST_NUMBER:
             found = f"a mass tolerance of {tolerance_kg:g} kg"

@@ -20,13 +20,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ident.arrays import BoolArray, FloatArray, IntArray, as_array, require_kind
+from ident.arrays import BoolArray, FloatArray, IntArray, as_array, require_flag, require_kind
 from ident.errors import ModelError
 from ident.model.bodies import LINK_PARAMETERS, LINK_UNITS, LOADED
 from ident.model.closed_chain import Assembly, TreeMotion, assemble, follow
 from ident.model.pivots import pivot_motion, pivot_rates
 from ident.model.regressor import fill_rigid, mass_matrix, rigid_torque
-from ident.model.robot import JointKind, Motion, Robot
+from ident.model.robot import JointKind, Motion, Robot, require_described
 
 DRIVE_UNITS = {
     JointKind.REVOLUTE: ("Nm", "rad/s", "kg m²"),
@@ -175,6 +175,8 @@ class Model:
         require_kind(
             "drive_train", self.drive_train, DriveTrain, "write DriveTrain(np.diag(gear_ratios))"
         )
+        require_flag("friction_by_payload", self.friction_by_payload)
+        require_described(self.robot)
         ratio = self.drive_train.ratio
         axes = self.robot.axis_count
         if len(ratio) != axes:
@@ -556,6 +558,7 @@ class Model:
         """Positions, velocities and accelerations of the axes, shape (m, k) each,
         once their shapes are checked.
         """
+        require_kind("motion", motion, Motion, "write Motion(position_rad, velocity_rad_s, ...)")
         count = self.robot.axis_count
         shapes = [np.shape(state) for state in _states(motion)]
         expected = (*shapes[0][:1], count)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ident.arrays import FloatArray, as_array
+from ident.arrays import FloatArray, as_array, require_entries, require_kind, require_number
+from ident.errors import ModelError
 
 
 class JointKind(Enum):
@@ -33,6 +34,15 @@ class Joint:
     #: From the lowest to the highest position that its description allows [rad or m]; None where
     #: it has no limits. Positions in another unit go far beyond it.
     travel: float | None = None
+    #: Lowest position that its description allows [rad or m]; None where it has no limits.
+    lowest: float | None = None
+
+    @property
+    def range(self) -> tuple[float, float] | None:
+        """Lowest and highest position that its description allows; None where it has no limits."""
+        if self.travel is None or self.lowest is None:
+            return None
+        return self.lowest, self.lowest + self.travel
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,6 +53,8 @@ class Place:
     rotation: FloatArray  #: of the frame in that joint's frame, (3, 3)
     translation_m: FloatArray  #: its origin there, (3,)
 
+
+UNIT_TOLERANCE = 1e-6  #: Of the length of a joint's axis from one
 
 #: What the name of a closure follows in the name of the joint that the loop was cut at
 PIVOT = "pivot"
@@ -203,6 +215,88 @@ class Robot:
     def axis_count(self) -> int:
         """m: motors, and what a recording has columns of."""
         return len(self.axis_joints)
+
+
+def require_described(robot: Robot) -> None:
+    """Refuse a robot made by hand whose parts are not what they are declared to be.
+
+    Raises:
+        ModelError: a part is of another type or shape, no finite number, or names a joint that
+            the robot does not have.
+    """
+    _require_tuple("joints", robot.joints, Joint)
+    if not robot.joints:
+        raise ModelError("the robot has no joint; expected at least one; read it from a URDF")
+    for index, joint in enumerate(robot.joints):
+        _require_joint(joint, index)
+    as_array("gravity_m_s2", robot.gravity_m_s2, (3,), "in the base frame [m/s²]")
+    count = robot.joint_count
+    for motor in _require_tuple("motors", robot.motors, int):
+        _require_index("an entry of motors", motor, count)
+    for closure in _require_tuple("closures", robot.closures, Closure):
+        _require_place(f"first of closure {closure.name!r}", closure.first, count)
+        _require_place(f"second of closure {closure.name!r}", closure.second, count)
+    for coupling in _require_tuple("couplings", robot.couplings, JointCoupling):
+        _require_index("follower of a coupling", coupling.follower, count)
+        _require_index("leader of a coupling", coupling.leader, count)
+        require_number("multiplier of a coupling", coupling.multiplier)
+        require_number("offset of a coupling", coupling.offset)
+    _require_tuple("pivots", robot.pivots, Pivot)
+    if robot.assembly_rad is not None:
+        as_array("assembly_rad", robot.assembly_rad, (count,), "one position per joint")
+    if robot.platform is not None:
+        _require_place("platform", robot.platform, count)
+
+
+Part = TypeVar("Part")
+
+
+def _require_tuple(name: str, values: tuple[Part, ...], kind: type[Part]) -> tuple[Part, ...]:
+    """Return the parts of a robot; refuse what is no tuple of them, as a `ModelError`."""
+    remedy = f"give a tuple of {kind.__name__}, or read the robot from a URDF"
+    require_kind(f"{name} of the robot", values, tuple, remedy)
+    require_entries(f"{name} of the robot", values, kind, remedy)
+    return values
+
+
+def _require_joint(joint: Joint, index: int) -> None:
+    """Refuse a joint with a part of another type or shape, as a `ModelError`."""
+    require_kind(f"name of joint {index}", joint.name, str, "give its name in the URDF")
+    label = f"of joint {joint.name!r}"
+    require_kind(f"kind {label}", joint.kind, JointKind, "write JointKind.REVOLUTE")
+    # The joint before it has a lower index: poses are found in this order.
+    _require_index(f"parent {label}", joint.parent, index, least=-1)
+    as_array(f"rotation {label}", joint.rotation, (3, 3), "in the parent's frame")
+    as_array(f"translation_m {label}", joint.translation_m, (3,), "in the parent's frame")
+    axis = as_array(f"axis {label}", joint.axis, (3,), "in the joint's frame")
+    length = float(np.linalg.norm(axis))
+    if abs(length - 1.0) > UNIT_TOLERANCE:
+        raise ModelError(
+            f"axis {label} has the length {length:.6g}; expected a unit vector; divide it by that"
+        )
+    if joint.travel is not None:
+        remedy = "leave it out without limits"
+        require_number(f"travel {label}", joint.travel, above=0.0, remedy=remedy)
+    if joint.lowest is not None:
+        require_number(f"lowest {label}", joint.lowest, remedy="leave it out without limits")
+
+
+def _require_place(label: str, place: Place, count: int) -> None:
+    """Refuse a frame with a part of another type or shape, as a `ModelError`."""
+    require_kind(label, place, Place, "write Place(joint, rotation, translation_m)")
+    _require_index(f"joint of the {label}", place.joint, count, least=-1)
+    as_array(f"rotation of the {label}", place.rotation, (3, 3), "in the joint's frame")
+    as_array(f"translation_m of the {label}", place.translation_m, (3,), "in the joint's frame")
+
+
+def _require_index(label: str, index: object, end: int, *, least: int = 0) -> None:
+    """Refuse what is no index of a joint from `least` to below `end`, as a `ModelError`."""
+    is_whole = isinstance(index, (int, np.integer)) and not isinstance(index, bool)
+    if not is_whole or not least <= index < end:  # type: ignore[operator]
+        raise ModelError(
+            f"{label} is {index!r:.60}; expected a whole number from {least} to {end - 1}; "
+            "give the index of a joint"
+        )
 
 
 @dataclass(frozen=True, slots=True)

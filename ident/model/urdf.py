@@ -17,7 +17,15 @@ from xml.etree.ElementTree import Element, ParseError, fromstring, tostring
 
 import numpy as np
 
-from ident.arrays import FloatArray, require_kind, takes
+from ident.arrays import (
+    FloatArray,
+    as_array,
+    require_entries,
+    require_kind,
+    require_names,
+    require_number,
+    takes,
+)
 from ident.errors import ModelError
 from ident.model.bodies import Body
 from ident.model.pivots import cut_pivots
@@ -76,6 +84,9 @@ class LinkPair:
     directions: tuple[str, ...]
 
 
+WRITE_CLOSURE = "write LinkPair(name, first, second, directions)"
+
+
 @takes()
 def robot_from_urdf(
     urdf: str,
@@ -107,8 +118,18 @@ def robot_from_urdf(
             joint mimics one that does not move, or itself, or is in a closed chain.
     """
     found = read_urdf(urdf)
+    gravity = as_array("gravity_m_s2", gravity_m_s2, (3,), "in the base frame [m/s²]")
+    require_entries("closures", closures, LinkPair, WRITE_CLOSURE)
+    require_names("motors", motors)
     if assembly_rad is None:
         assembly_rad = {}
+    require_kind("assembly_rad", assembly_rad, Mapping, "write {'joint': 0.5}")
+    require_names("assembly_rad", list(assembly_rad))
+    for joint_name, position in assembly_rad.items():
+        remedy = "give its position in rad, or m"
+        require_number(f"assembly_rad[{joint_name!r}]", position, remedy=remedy)
+    if platform is not None:
+        require_kind("platform", platform, str, "give the name of a link")
     index = {joint.name: number for number, joint in enumerate(found.joints)}
     couplings = _couplings(mimics_of(urdf), index)
     if couplings and closures:
@@ -132,7 +153,6 @@ def robot_from_urdf(
     if couplings and not driven:
         followers = {coupling.follower for coupling in couplings}
         driven = tuple(number for number in index.values() if number not in followers)
-    gravity = np.asarray(gravity_m_s2, dtype=np.float64)
     robot = Robot(
         joints=found.joints,
         gravity_m_s2=gravity,
@@ -159,7 +179,8 @@ def _require_joints(source: str, names: Iterable[str], joints: Mapping[str, int]
     for name in names:
         if name not in joints:
             raise ModelError(
-                f"{source} names joint {name!r}; the URDF has the moving joints {', '.join(joints)}"
+                f"{source} names joint {name!r}; expected one of the URDF's moving joints: "
+                f"{', '.join(joints)}"
             )
 
 
@@ -181,10 +202,11 @@ def _closure(found: UrdfRobot, pair: LinkPair) -> Closure:
     Raises:
         ModelError: it has a link that the URDF does not have, or unknown directions.
     """
-    require_kind(
-        "an entry of closures", pair, LinkPair, "write LinkPair(name, first, second, directions)"
-    )
+    require_kind("name of a closure", pair.name, str, WRITE_CLOSURE)
     source = f"closure {pair.name!r}"
+    require_kind(f"first link of {source}", pair.first, str, WRITE_CLOSURE)
+    require_kind(f"second link of {source}", pair.second, str, WRITE_CLOSURE)
+    require_names(f"directions of {source}", pair.directions)
     are_known = set(pair.directions) <= set(DIRECTIONS)
     are_distinct = len(set(pair.directions)) == len(pair.directions)
     if not (pair.directions and are_known and are_distinct):
@@ -608,6 +630,12 @@ def _joint(element: Element, at: Place) -> Joint:
             f"joint {name!r} lies {distance:.3g} m from the one before it; expected at most "
             f"{LARGEST_DISTANCE_M:g} m: is the URDF in mm?"
         )
+    lowest: float | None = None
+    travel: float | None = None
+    limits = _position_limits(element)
+    if limits is not None:
+        lowest, highest = limits
+        travel = highest - lowest
     return Joint(
         name=name,
         kind=KINDS[kind],
@@ -615,12 +643,13 @@ def _joint(element: Element, at: Place) -> Joint:
         rotation=at.rotation,
         translation_m=at.translation_m,
         axis=axis,
-        travel=_travel(element),
+        travel=travel,
+        lowest=lowest,
     )
 
 
-def _travel(element: Element) -> float | None:
-    """Travel of a joint by its limits [rad or m]; None where they say nothing."""
+def _position_limits(element: Element) -> tuple[float, float] | None:
+    """Lowest and highest position of a joint [rad or m]; None where its limits say nothing."""
     limit = element.find("limit")
     if limit is None or element.get("type") == "continuous":
         return None
@@ -629,9 +658,8 @@ def _travel(element: Element) -> float | None:
         lower = float(limit.get("lower", ""))
     except ValueError:
         return None
-    travel = upper - lower
-    if 0.0 < travel < inf:
-        return travel
+    if 0.0 < upper - lower < inf:
+        return lower, upper
     return None
 
 

@@ -10,8 +10,56 @@ from numpy.typing import ArrayLike
 
 from ident.arrays import FloatArray, as_array
 from ident.errors import ModelError
+from ident.model.robot import Joint, Robot
 
 POSITION_MARGIN = 0.03  #: Share of a joint's range that targets keep from its limits
+
+
+#: Share of a follower's travel by which it may go beyond its limits: the rounding of a URDF
+ROUNDING = 1e-4
+
+
+@dataclass(frozen=True, slots=True)
+class FollowerBeyond:
+    """A joint that follows an axis, and goes beyond its own limits where the axis keeps its."""
+
+    axis: int  #: index of the axis that it follows
+    joint: Joint  #: the follower
+    reached: tuple[float, float]  #: its least and largest position [rad or m]
+    #: positions of the axis at which it keeps its limits, the least and the largest [rad or m]
+    axis_range: tuple[float, float]
+
+
+def followers_beyond(
+    robot: Robot, lower: FloatArray, upper: FloatArray
+) -> tuple[FollowerBeyond, ...]:
+    """Name the joints that follow an axis and go beyond their own limits.
+
+    Args:
+        robot: of m axes, whose followers are its couplings.
+        lower, upper: positions between which the axes stay [rad or m], shape (m,).
+    """
+    found: list[FollowerBeyond] = []
+    for coupling in robot.couplings:
+        joint = robot.joints[coupling.follower]
+        if joint.range is None or coupling.multiplier == 0.0:
+            continue
+        least, largest = joint.range
+        axis = robot.axis_joints.index(coupling.leader)
+        ends = (lower[axis], upper[axis])
+        reached = [coupling.multiplier * end + coupling.offset for end in ends]
+        rounding = ROUNDING * (largest - least)
+        if min(reached) >= least - rounding and max(reached) <= largest + rounding:
+            continue
+        of_axis = [(end - coupling.offset) / coupling.multiplier for end in joint.range]
+        beyond = FollowerBeyond(
+            axis=axis,
+            joint=joint,
+            reached=(float(min(reached)), float(max(reached))),
+            axis_range=(min(of_axis), max(of_axis)),
+        )
+        found.append(beyond)
+    return tuple(found)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

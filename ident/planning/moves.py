@@ -17,11 +17,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ident.arrays import FloatArray, as_array, require_count, require_kind, require_number, takes
-from ident.data.conditioning import Conditioning
+from ident.data.conditioning import Conditioning, require_cutoffs, require_settings
 from ident.errors import ModelError, PlanUnfit
 from ident.model.bodies import Payload
 from ident.model.model import Model
-from ident.model.robot import Motion
+from ident.model.robot import JointKind, Motion, Robot
 from ident.planning.effort import EFFORT_MARGIN, believable_efforts, effort_shares
 from ident.planning.excitation import (
     Design,
@@ -32,7 +32,7 @@ from ident.planning.excitation import (
     rows_between_rests,
     visible_base,
 )
-from ident.planning.limits import JointLimits
+from ident.planning.limits import JointLimits, followers_beyond
 
 DWELL_S = 0.1  #: Rest at each target [s]: moves are told apart by it
 #: Least speed of a random move, as a share of the fastest that its limits allow
@@ -257,7 +257,7 @@ def plan_moves(
 
     Args:
         model: the declared model of a serial robot; joints may follow axes (`<mimic>`).
-        limits: of the axes; narrow enough for the joints that follow them.
+        limits: of the axes. Joints that follow them must keep the limits of the URDF, too.
         payload: that will be mounted, with its known mass.
         nameplate: gains by the data sheet, shape (n,); their sizes decide how clearly a torque
             shows.
@@ -274,8 +274,8 @@ def plan_moves(
         third to a twelfth of this σ.
 
     Raises:
-        ModelError: an argument is of another type or shape, a limit is none, or the robot is a
-            closed chain.
+        ModelError: an argument is of another type or shape, a limit is none, a joint that follows
+            an axis would go beyond its own limits, or the robot is a closed chain.
         PlanUnfit: the duration has no room for enough moves, or some gain does not show in them.
     """
     require_kind("model", model, Model, "write Model(robot, drive_train)")
@@ -287,6 +287,8 @@ def plan_moves(
         require_kind("urdf", urdf, str, "give the text of the file: Path(...).read_text()")
     if conditioning is not None:
         require_kind("conditioning", conditioning, Conditioning, "write Conditioning()")
+        require_settings(conditioning)
+        require_cutoffs(conditioning)
     if model.robot.closures:
         names = ", ".join(closure.name for closure in model.robot.closures)
         raise ModelError(
@@ -301,6 +303,7 @@ def plan_moves(
             f"nameplate is {gains.tolist()}; expected no zero: such a motor moves nothing"
         )
     limits.require_size(count)
+    _require_followers(model.robot, limits)
     duration_s = require_number(
         "duration_s", duration_s, above=0.0, remedy="give the time of one run, such as 40"
     )
@@ -330,6 +333,28 @@ def plan_moves(
         dwell_s=DWELL_S,
         predicted_std_percent=predicted,
     )
+
+
+def _require_followers(robot: Robot, limits: JointLimits) -> None:
+    """Refuse limits of axes at which a joint that follows one goes beyond its own.
+
+    Raises:
+        ModelError: for the first such joint.
+    """
+    for beyond in followers_beyond(robot, limits.lower, limits.upper):
+        axis = robot.axes[beyond.axis]
+        joint = beyond.joint
+        unit = "rad"
+        if joint.kind is JointKind.PRISMATIC:
+            unit = "m"
+        least, largest = joint.range or beyond.reached
+        first, last = beyond.axis_range
+        raise ModelError(
+            f"limits: joint {joint.name}, which follows {axis.name}, goes from "
+            f"{beyond.reached[0]:.4g} to {beyond.reached[1]:.4g} {unit}; expected {least:.4g} to "
+            f"{largest:.4g} {unit}, its limits in the URDF; give {axis.name} limits within "
+            f"{first:.4g} to {last:.4g}"
+        )
 
 
 def _search_of(

@@ -312,6 +312,25 @@ def test_an_effect_that_does_not_exist_is_refused(
         placed_effect(effect, calibrated(identified))
 
 
+def test_an_effect_that_a_calibration_has_twice_is_refused(identified: Evidence) -> None:
+    """Its torque would count twice; two orders of one effect are two effects."""
+    spring = AcceptedEffect("spring", "J3", {}, (STIFFNESS,), 1.0, 1.0)
+    calibration = replace(calibrated(identified), effects=(spring, spring))
+    data = identified.datasets[0]
+    words = "found the effect spring on J3 twice .*; expected each effect once on an axis; take one"
+    with pytest.raises(EffectRefused, match=words):
+        predict_torque(calibration, identified.model, data)
+    orders: list[AcceptedEffect] = []
+    for order in (6, 12):
+        placed = PlacedEffect(Cogging(order), 2)
+        coefficients = [Parameter(one.name, 0.1, 0.1, one.unit) for one in placed.columns]
+        settings = placed.effect.settings
+        orders.append(AcceptedEffect("cogging", "J3", settings, tuple(coefficients), 1.0, 1.0))
+    two_orders = replace(calibration, effects=tuple(orders))
+    torque_nm = predict_torque(two_orders, identified.model, data)
+    assert torque_nm.shape == data.position_rad.shape
+
+
 @pytest.mark.parametrize(
     ("name", "settings", "words"),
     [

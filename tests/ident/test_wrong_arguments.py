@@ -693,3 +693,315 @@ def test_gains_by_name_are_told_how_to_become_a_list(arguments: dict[str, Any]) 
         lax.calibration_of(arguments["found"], axes, by_name)
     with pytest.raises(ident.ModelError, match=r"write \[fixed_gains\[name\] for name in axes"):
         lax.identify(arguments["model"], arguments["runs"], fixed_gains=by_name)
+
+
+def _planned(arguments: dict[str, Any], **changed: Any) -> Any:
+    """A plan without tries, with some arguments changed."""
+    ones = np.ones(3)
+    usual = {
+        "model": arguments["model"],
+        "limits": ident.JointLimits(-ones, ones, ones, 2.0 * ones),
+        "payload": MOUNTED,
+        "nameplate": 20.0 * ones,
+        "urdf": THREE_AXES.urdf,
+        "duration_s": 30.0,
+        "exchanges": 0,
+    }
+    return lax.plan_moves(**{**usual, **changed})
+
+
+def _with_joint(arguments: dict[str, Any], **changed: Any) -> ident.Model:
+    """The model with another second joint, as it is made by hand."""
+    robot = arguments["model"].robot
+    first, second, third = robot.joints
+    joints = (first, replace(second, **changed), third)
+    return ident.Model(replace(robot, joints=joints), DRIVE_TRAIN)
+
+
+def _searched(arguments: dict[str, Any], **changed: Any) -> Any:
+    """A search for effects, with an argument that ends it before it begins."""
+    evidence = ident.gather(arguments["found"], arguments["runs"])
+    usual = {"start": evidence, "rng": np.random.default_rng(0)}
+    return lax.find_effects(**{**usual, **changed})
+
+
+def _external(arguments: dict[str, Any], **changed: Any) -> Any:
+    """External torque with a band of which some numbers are changed."""
+    ones = np.ones(3)
+    band = ident.Band(
+        scale=np.ones((3, 4)),
+        factor=ones,
+        threshold=ones,
+        correlation_s=ones,
+        quiet_s=ones,
+        alarms_per_hour=1.0,
+    )
+    return ident.external_torque(
+        arguments["calibration"],
+        arguments["model"],
+        arguments["run"],
+        band=replace(band, **changed),
+    )
+
+
+def _predicted(arguments: dict[str, Any], **changed: Any) -> FloatArray:
+    """A prediction by a calibration of which some parts are changed."""
+    calibration = replace(arguments["calibration"], **changed)
+    data = ident.planned(arguments["motion"], 500.0)
+    return ident.predict_current(calibration, arguments["model"], data)
+
+
+def _turned(arguments: dict[str, Any], **changed: Any) -> Any:
+    """A judgement of the geometry by rows of which some are changed."""
+    instants = replace(arguments["instants"][0], **changed)
+    return ident.find_turned_geometry(arguments["model"], [instants], arguments["gains"])
+
+
+WITH_ROBOT = lax.robot_from_urdf
+
+
+@pytest.mark.parametrize(
+    ("use", "words"),
+    [
+        (
+            lambda _: lax.Payload(3.5, "flange"),
+            "name of a payload is of type float; expected str; write Payload",
+        ),
+        (
+            lambda _: lax.Payload("disc", None),
+            "mounting of payload 'disc' is of type NoneType; expected str",
+        ),
+        (
+            lambda _: lax.Payload("disc", "flange", {"m": 10**400}),
+            "has m = 1000.*; expected finite numbers",
+        ),
+        (
+            lambda _: lax.Payload("disc", "flange", {"m": 4.0}, mass_tolerance_kg=True),
+            "mass_tolerance_kg is True; expected a number",
+        ),
+        (
+            lambda a: lax.Model(a["model"].robot, DRIVE_TRAIN, friction_by_payload="no"),
+            "friction_by_payload is of type str; expected bool; give True or False",
+        ),
+        (
+            lambda a: a["model"].regressor(np.zeros((9, 3))),
+            "motion is of type ndarray; expected Motion; write Motion",
+        ),
+        (
+            lambda _: WITH_ROBOT(THREE_AXES.urdf, (0.0, -9.81)),
+            r"gravity_m_s2 has shape \(2,\); expected \(3,\), in the base frame",
+        ),
+        (
+            lambda _: WITH_ROBOT(THREE_AXES.urdf, ("0", "0", "down")),
+            "gravity_m_s2 is no array of numbers",
+        ),
+        (
+            lambda _: WITH_ROBOT(THREE_AXES.urdf, closures=None),
+            "closures is of type NoneType; expected Iterable; write LinkPair",
+        ),
+        (
+            lambda _: WITH_ROBOT(THREE_AXES.urdf, closures={"loop": 1}),
+            "closures is of type dict; expected a list; write LinkPair",
+        ),
+        (
+            lambda _: WITH_ROBOT(THREE_AXES.urdf, motors="q0"),
+            r"motors is the text 'q0'; expected a list of names; write \['q0'\]",
+        ),
+        (
+            lambda _: WITH_ROBOT(THREE_AXES.urdf, motors=[1]),
+            "an entry of motors is of type int; expected str",
+        ),
+        (
+            lambda _: WITH_ROBOT(THREE_AXES.urdf, motors=["q9"]),
+            "motors names joint 'q9'; expected one of the URDF's moving joints: q0, q1, q2",
+        ),
+        (
+            lambda _: WITH_ROBOT(THREE_AXES.urdf, assembly_rad=["q0"]),
+            "assembly_rad is of type list; expected Mapping; write",
+        ),
+        (
+            lambda _: WITH_ROBOT(THREE_AXES.urdf, assembly_rad={"q0": float("nan")}),
+            r"assembly_rad\['q0'\] is nan; expected a finite number",
+        ),
+        (
+            lambda _: WITH_ROBOT(THREE_AXES.urdf, platform=["link2"]),
+            "platform is of type list; expected str; give the name of a link",
+        ),
+        (
+            lambda _: WITH_ROBOT(THREE_AXES.urdf, closures=[lax.LinkPair("a", 1, "link2", "x")]),
+            "first link of closure 'a' is of type int; expected str",
+        ),
+        (
+            lambda _: WITH_ROBOT(
+                THREE_AXES.urdf, closures=[lax.LinkPair("a", "link0", "link2", "xy")]
+            ),
+            "directions of closure 'a' is the text 'xy'; expected a list",
+        ),
+        (
+            lambda a: _with_joint(a, kind="revolute"),
+            "kind of joint 'q1' is of type str; expected JointKind",
+        ),
+        (
+            lambda a: _with_joint(a, parent=1),
+            "parent of joint 'q1' is 1; expected a whole number from -1 to 0",
+        ),
+        (
+            lambda a: _with_joint(a, axis=np.array([0.0, 2.0, 0.0])),
+            "axis of joint 'q1' has the length 2; expected a unit vector",
+        ),
+        (
+            lambda a: _with_joint(a, rotation=np.eye(4)),
+            r"rotation of joint 'q1' has shape \(4, 4\); expected \(3, 3\)",
+        ),
+        (
+            lambda a: ident.Model(replace(a["model"].robot, motors=(0, 1, 7)), DRIVE_TRAIN),
+            "an entry of motors is 7; expected a whole number from 0 to 2",
+        ),
+        (
+            lambda a: ident.Model(replace(a["model"].robot, joints=None), DRIVE_TRAIN),
+            "joints of the robot is of type NoneType; expected tuple",
+        ),
+        (
+            lambda a: _planned(a, conditioning=lax.Conditioning(position_cutoff_hz="40")),
+            "position_cutoff_hz of the conditioning is of type str",
+        ),
+        (
+            lambda a: _planned(a, conditioning=lax.Conditioning(decimation_cutoff_hz=0.0)),
+            "cut-off of 0 Hz; expected above 0 Hz",
+        ),
+        (
+            lambda a: _planned(a, duration_s=10**400),
+            "duration_s is inf; expected a finite number",
+        ),
+        (
+            lambda a: _planned(a, nameplate=[10**400] * 3),
+            "nameplate is no array of numbers",
+        ),
+        (
+            lambda a: lax.diagnose(a["found"], a["axes"], effort_limit=[1.0]),
+            r"effort_limit has shape \(1,\); expected \(3,\), one per axis",
+        ),
+        (
+            lambda a: lax.diagnose(a["found"], a["axes"], effort_limit=[1.0, np.nan, 1.0]),
+            "effort_limit is .*; expected no number below zero; give inf",
+        ),
+        (
+            lambda a: lax.identify(a["model"], a["runs"], judge="no"),
+            "judge of identify is of type str; expected bool",
+        ),
+        (
+            lambda a: lax.identify(a["model"], a["runs"], method=np.ones(2)),
+            "method of identify is of type ndarray; expected Method or str",
+        ),
+        (
+            lambda a: lax.calibration_of(a["found"], a["axes"], a["nameplate"], steps=["x"]),
+            "an entry of steps is of type str; expected Step",
+        ),
+        (
+            lambda a: _searched(a, gates=ident.Gates(false_alarm=3.5)),
+            "false_alarm of the gates is 3.5; expected a share from 0 to 1; 0.01 is usual",
+        ),
+        (
+            lambda a: _searched(a, gates=lax.Gates(draws=9.5)),
+            "draws of the gates is 9.5; expected a whole number",
+        ),
+        (
+            lambda a: _searched(a, progress="print"),
+            "progress is of type str; expected a function of one text; write progress=print",
+        ),
+        (
+            lambda a: _searched(a, families=(1,)),
+            "an entry of families is of type int; expected Sequence; leave it out",
+        ),
+        (
+            lambda a: _searched(a, mistakes=["x"]),
+            "an entry of mistakes is of type str; expected Finding; leave it out",
+        ),
+        (
+            lambda a: lax.accept_on_holdout(
+                ident.gather(a["found"], a["runs"]), ["x"], progress=print
+            ),
+            "an entry of steps is of type str; expected Step",
+        ),
+        (
+            lambda a: _external(a, scale=np.ones((2, 4))),
+            r"scale of the band has shape \(2, 4\); expected \(3, 4\), one row per joint",
+        ),
+        (
+            lambda a: _predicted(a, gains=["x"]),
+            "an entry of gains of the calibration is of type str; expected Gain",
+        ),
+        (
+            lambda a: _predicted(a, gains=[replace(a["calibration"].gains[0], value=np.nan)] * 3),
+            "gains of the calibration holds 3 non-finite values",
+        ),
+        (
+            lambda a: _predicted(a, effects=None),
+            "effects of the calibration is of type NoneType; expected Iterable; take it from",
+        ),
+        (
+            lambda a: _turned(a, current_a=np.ones((2, 2))),
+            r"current_a of the instants has shape \(2, 2\); expected \(3, ",
+        ),
+        (
+            lambda a: lax.GrowingFit(a["model"], None, ()).with_run(a["run"]),
+            "conditioning is of type NoneType; expected Conditioning; write Conditioning",
+        ),
+        (
+            lambda a: lax.GrowingFit(a["model"], a["conditioning"], "disc").with_run(a["run"]),
+            "payloads is of type str; expected a list; give a tuple of the payloads",
+        ),
+        (
+            lambda a: ident.GrowingFit(a["model"], a["conditioning"], ()).with_run(lax),
+            "run is of type module; expected Run; write Run",
+        ),
+    ],
+)
+def test_a_wrong_value_inside_a_public_object_is_refused_by_name(
+    arguments: dict[str, Any], use: Change, words: str
+) -> None:
+    with pytest.raises(ident.IdentificationError, match=words):
+        use(arguments)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "words"),
+    [
+        ("payload", 4.0, "payload of 'bare' is of type float; expected Payload; write"),
+        ("digest", ["x"], "digest of 'bare' is of type list; expected str"),
+        ("partial", "no", "partial of 'bare' is of type str; expected bool"),
+        ("recording", "log", "recording of 'bare' is of type str; expected Recording"),
+        ("torque_channels", 1, "torque_channels of 'bare' is of type int; expected"),
+        ("judged_channels", True, "judged_channels of 'bare' is of type bool; expected"),
+    ],
+)
+def test_a_field_of_a_run_that_is_no_array_is_refused_wherever_the_run_is_used(
+    arguments: dict[str, Any], field: str, value: Any, words: str
+) -> None:
+    wrong = replace(arguments["run"], **{field: value})
+    model = arguments["model"]
+    with pytest.raises(ident.ModelError, match=words):
+        ident.differentiate(wrong, model.drive_train)
+    with pytest.raises(ident.ModelError, match=words):
+        ident.identify(model, [wrong, *arguments["loaded"]])
+
+
+@pytest.mark.parametrize(
+    ("setting", "value", "words"),
+    [
+        ("decimation_cutoff_hz", float("nan"), "cut-off of nan Hz; expected above 0 Hz"),
+        ("current_cutoff_hz", float("nan"), "cut-off of nan Hz; expected above 0 Hz"),
+        ("current_cutoff_hz", float("inf"), "cut-off of inf Hz; expected above 0 Hz, and finite"),
+        ("standstill_share", 3.5, "standstill_share of the conditioning is 3.5; expected 0 to 1"),
+        ("position_cutoff_hz", True, "position_cutoff_hz of the conditioning is True; expected a"),
+        ("standstill_rad_s", 0.03, "standstill_rad_s .* is of type float; expected a tuple"),
+        ("standstill_rad_s", (0.03, -1.0, 0.03), "entry 2 of standstill_rad_s .* is -1; expected"),
+        ("standstill_rad_s", (0.03, "x", 0.03), "entry 2 of standstill_rad_s .* of type str"),
+    ],
+)
+def test_a_setting_of_the_conditioning_that_is_no_number_of_its_range_is_refused(
+    arguments: dict[str, Any], setting: str, value: Any, words: str
+) -> None:
+    conditioning = lax.Conditioning(**{setting: value})
+    with pytest.raises(ident.IdentificationError, match=words):
+        ident.differentiate(arguments["run"], arguments["drive_train"], conditioning)

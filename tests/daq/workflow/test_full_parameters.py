@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +14,7 @@ import yaml
 
 import daq.environment
 from daq.cli.app import main
+from daq.config.cell_file import load_cell
 from daq.documents.calibration_file import decode_calibration, encode_calibration, load_calibration
 from daq.errors import ConfigurationInconsistent, ExitCode, UsageError
 from daq.report.full_parameters import full_parameter_view
@@ -90,6 +92,33 @@ def test_masses_that_are_wrong_are_said(fitted: Fit, urdf: str) -> None:
     said = "\n".join(map(str, full_parameter_view(calibration, heavy)))
     assert "CHECK the prior: by the data, the links together are 0." in said
     assert "What is marked `prior` is not to be trusted" in said
+
+
+@pytest.mark.slow
+def test_a_robot_with_joints_that_follow_or_close_a_loop_is_refused_by_their_names(
+    fitted: Fit, checkout: Path, tmp_path: Path
+) -> None:
+    """Before its inertias are: those of a gripper's fingers are often missing."""
+    folder = tmp_path / "configs"
+    shutil.copytree(checkout / "configs", folder)
+    urdf = folder / "robots" / "tx40.urdf"
+    follower = """<link name="finger"/><joint name="gripper" type="revolute">
+      <parent link="link6"/><child link="finger"/><axis xyz="0 1 0"/>
+      <limit lower="-9" upper="9" velocity="9" effort="9"/>
+      <mimic joint="J5" multiplier="-0.5"/></joint></robot>"""
+    text = urdf.read_text(encoding="utf-8")
+    urdf.write_text(text.replace("</robot>", follower), encoding="utf-8")
+    followed = load_cell(folder / "cells" / "tx40.yaml")
+    five_bar = load_cell(folder / "cells" / "five-bar.yaml")
+    for cell, words in (
+        (followed, "joints that follow others in the URDF: gripper"),
+        (five_bar, "joints of a closed chain without a motor: "),
+    ):
+        with pytest.raises(UsageError) as caught:
+            full_set(replace(fitted, cell=cell), cell.urdf, OF_CELL, 0.1)
+        assert caught.value.found.startswith(words)
+        assert "each joint with a motor" in caught.value.expected
+        assert "fit without --prior and --prior-tolerance" in caught.value.remedy
 
 
 def _scaled(urdf: str, factor: float) -> str:

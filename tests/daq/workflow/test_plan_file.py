@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -48,6 +49,53 @@ def demo() -> Cell:
 def made(demo: Cell) -> Plan:
     """A short plan for it."""
     return plan(demo, seed=1, duration_s=8.0, exchanges=10)
+
+
+@pytest.fixture
+def followed(tmp_path: Path) -> Cell:
+    """The demonstration's cell with a joint that follows J5, within ±0.5 rad of its own."""
+    folder = tmp_path / "configs"
+    shutil.copytree(CELLS.parent, folder)
+    urdf = folder / "robots" / "tx40.urdf"
+    follower = """<link name="behind"/><joint name="rod" type="revolute"><origin xyz="0 0 0.1"/>
+      <parent link="link6"/><child link="behind"/><axis xyz="0 1 0"/>
+      <limit lower="-0.5" upper="0.5" velocity="9" effort="9"/>
+      <mimic joint="J5" multiplier="-0.5" offset="0.1"/></joint></robot>"""
+    text = urdf.read_text(encoding="utf-8")
+    urdf.write_text(text.replace("</robot>", follower), encoding="utf-8")
+    return load_cell(folder / "cells" / "demo.yaml")
+
+
+def _with_limits_of_j5(cell: Cell, lower_deg: float, upper_deg: float) -> Cell:
+    *before, fifth, last = cell.axes
+    position = (float(np.radians(lower_deg)), float(np.radians(upper_deg)))
+    narrow = replace(fifth, limits=replace(fifth.limits, position=position))
+    return replace(cell, axes=(*before, narrow, last))
+
+
+def test_a_joint_that_follows_an_axis_keeps_its_own_limits_in_a_plan(
+    followed: Cell, tmp_path: Path
+) -> None:
+    with pytest.raises(ConfigurationInconsistent) as caught:
+        plan(followed, seed=1, duration_s=8.0, exchanges=0)
+    error = caught.value
+    assert "limits of J5" in error.subject
+    assert error.found.startswith("joint rod, which follows it, from -")
+    assert error.expected == "-28.648 deg to 28.648 deg, its limits in the URDF"
+    # (±0.5 − 0.1)/(−0.5) = −0.8 and 1.2 rad
+    assert "give J5 `limits` within -45.837 deg to 68.755 deg, or correct" in error.remedy
+    narrow = _with_limits_of_j5(followed, -45.8, 68.7)
+    made = plan(narrow, seed=1, duration_s=8.0, exchanges=0, largest_condition=1e12)
+    path = tmp_path / "plan.yaml"
+    save_plan(made, path)
+    assert load_plan(path, narrow).moves == made.moves
+    by_hand = OLD.replace("[10, 5, 80, 0, 0, 0]", "[10, 5, 80, 0, 90, 0]")
+    path.write_text(by_hand, encoding="utf-8")
+    with pytest.raises(
+        ConfigurationInconsistent,
+        match=r"moves\[1\], J5: found joint rod, which follows it, at -39\.2.* deg; expected -28",
+    ):
+        load_plan(path, followed)
 
 
 @pytest.mark.parametrize("name", ["demo", "gantry"])

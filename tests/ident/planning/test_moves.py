@@ -185,6 +185,25 @@ def test_a_robot_with_a_joint_that_follows_an_axis_is_planned_for_with_what_it_c
     assert np.all(found_percent < plan.predicted_std_percent)
 
 
+def test_limits_at_which_a_follower_goes_beyond_its_own_are_refused() -> None:
+    model, _ = _belted(None)
+    robot = model.robot
+    follower = replace(robot.joints[2], lowest=-0.5, travel=1.0)
+    narrow = replace(model, robot=replace(robot, joints=(*robot.joints[:2], follower)))
+    limits = ident.JointLimits([-2.9, -2.0], [2.9, 2.0], [3.0, 2.5], [12.0, 10.0])
+    nameplate = EXAMPLE.NAMEPLATE_NM_A[:2]
+    # −0.8 q + 0.3: −1.3 to 1.9 rad for q within ±2, and ±0.5 rad for q from −0.25 to 1 rad
+    words = (
+        r"limits: joint J3, which follows J2, goes from -1.3 to 1.9 rad; expected -0.5 to 0.5 rad, "
+        r"its limits in the URDF; give J2 limits within -0.25 to 1$"
+    )
+    with pytest.raises(ident.ModelError, match=words):
+        ident.plan_moves(narrow, limits, EXAMPLE.DISC, nameplate, exchanges=0)
+    inside = ident.JointLimits([-2.9, -0.25], [2.9, 1.0], [3.0, 2.5], [12.0, 10.0])
+    plan = ident.plan_moves(narrow, inside, EXAMPLE.DISC, nameplate, exchanges=0)
+    assert plan.target_rad[:, 1].min() >= -0.25
+
+
 @pytest.mark.slow
 def test_the_same_seed_gives_the_same_moves(model: ident.Model, plan: ident.PlannedMoves) -> None:
     nameplate = list(EXAMPLE.NAMEPLATE_NM_A)
