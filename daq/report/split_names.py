@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ident.discovery.loop import Step
-from ident.discovery.search import Finding, effect_key, is_better
-from ident.effects.effect import PlacedEffect
+from ident.discovery.search import Finding, is_better
+from ident.effects.effect import PlacedEffect, effect_key
 
 
 @dataclass(frozen=True, slots=True)

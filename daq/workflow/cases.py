@@ -17,6 +17,7 @@ from daq.workflow.choices import Known
 from daq.workflow.diagnoses import named_causes, nameplate_of
 from daq.workflow.fit import Fit, LogLoader, calibration_of, judged, refuse_effects
 from ident.calibration import Calibration, Parameter, PayloadMass, Source, factor_of
+from ident.data.run import SeenRuns
 from ident.equations.reduction import reduce_runs, regrouped
 from ident.equations.system import System, require_distinct
 from ident.estimators.comparison import Essential, essential
@@ -94,7 +95,7 @@ def reduce_logs(
     model = model_of(reading.cell)
     conditioning = reading.cell.conditioning
     used = reduce_runs(model, reading.runs(logs, "fit"), conditioning, instruments=instruments)
-    rest = each_run(reading.runs(holdout, "holdout"), set(), used.payloads)
+    rest = each_run(reading.runs(holdout, "holdout"), SeenRuns(), used.payloads)
     unseen = reduce_runs(model, rest, conditioning, payloads=used.payloads)
     return ReducedLogs(
         reading.cell,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from hashlib import blake2b
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -21,6 +22,7 @@ from ident.arrays import (
 from ident.data.channel_faults import JudgedChannels
 from ident.data.conditioning import Conditioning
 from ident.data.torque_channel import TorqueChannel
+from ident.errors import DataUnfit
 from ident.model.bodies import Payload
 
 
@@ -138,6 +140,61 @@ def require_named(run: Run) -> None:
     if run.started_s is not None:
         remedy = "leave it out without a clock that the runs share"
         require_number(f"started_s of {run.name!r}", run.started_s, remedy=remedy)
+
+
+class SeenRuns:
+    """Runs of a fit so far. No two may have the same samples, or one name, unless they are of
+    different logs.
+    """
+
+    def __init__(self) -> None:
+        self._names: set[tuple[str, str]] = set()
+        #: name and role of each run by the digest of its samples: the runs are not kept
+        self._by_content: dict[bytes, str] = {}
+
+    def add(self, run: Run) -> None:
+        """Add a run.
+
+        Raises:
+            DataUnfit: there is one of this name, or with the same samples.
+        """
+        if (run.name, run.digest) in self._names:
+            raise DataUnfit(
+                run.name, "found two runs of this name; expected another name for each; rename one"
+            )
+        self._names.add((run.name, run.digest))
+        content = _content_of(run)
+        if content is None:
+            return
+        if content in self._by_content:
+            raise DataUnfit(
+                run.name,
+                f"found the samples of run {self._by_content[content]} in it, too "
+                f"({_role_of(run)}); expected each recording once, in the fit or held out, with "
+                "the payload that was mounted; leave one of the two out",
+            )
+        self._by_content[content] = f"{run.name!r} ({_role_of(run)})"
+
+
+def _role_of(run: Run) -> str:
+    """What a run carries, in words."""
+    if run.payload is None:
+        return "without load"
+    return f"with payload {run.payload.name!r}"
+
+
+def _content_of(run: Run) -> bytes | None:
+    """Digest of the samples of a run; None where they are no arrays of numbers."""
+    digest = blake2b()
+    for values in (run.position_rad, run.current_a):
+        try:
+            array = np.asarray(values)
+        except (TypeError, ValueError, OverflowError):
+            return None
+        if array.dtype.kind not in "fiu":
+            return None
+        digest.update(array.tobytes())
+    return digest.digest()
 
 
 def usual_conditioning(runs: Iterable[Run]) -> Conditioning:

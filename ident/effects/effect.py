@@ -17,7 +17,7 @@ from typing import Annotated, Self, get_args, get_type_hints
 
 import numpy as np
 
-from ident.arrays import FloatArray
+from ident.arrays import FloatArray, require_real
 from ident.data.conditioning import Conditioning
 from ident.data.dataset import Dataset
 from ident.effects.signals import Abscissa, Signals, watched_s
@@ -543,7 +543,7 @@ def _own_columns(effect: Effect, signals: Signals, axis: int, count: int) -> Flo
     Their shape must be right and their numbers finite.
     """
     try:
-        found = np.asarray(effect.columns(signals, axis), dtype=np.float64)
+        returned = np.asarray(effect.columns(signals, axis))
     # Code of others: it may fail in any way, and even end the program.
     except (Exception, SystemExit) as error:
         raise EffectRefused(
@@ -551,6 +551,9 @@ def _own_columns(effect: Effect, signals: Signals, axis: int, count: int) -> Flo
             "`columns`; expected a torque for every sample; correct it, and copy what it changes: "
             "the arrays of `signals` are read-only"
         ) from error
+    label = f"what the method `columns` of effect {effect.name!r} returns"
+    require_real(label, returned, EffectRefused, "a torque for every sample")
+    found = np.asarray(returned, dtype=np.float64)
     ahead = _SHAPES.get(effect.side, (count,))
     expected = (*ahead, len(effect.coefficients), len(signals.time_s))
     if found.shape != expected:

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from ident.arrays import FloatArray, as_array, require_kind, require_names, takes
 from ident.data.conditioning import Conditioning
 from ident.data.dataset import Dataset
-from ident.data.run import Run, require_named, usual_conditioning
+from ident.data.run import Run, SeenRuns, require_named, usual_conditioning
 from ident.data.run_channels import RunChannels, channels_of, require_usable_channels
 from ident.equations.instants import Instants, instants_of
 from ident.equations.observation import observe
@@ -86,12 +86,12 @@ def identify(
         CurrentUnsigned: see `ident.estimators.diagnosis.require_explained_currents`.
         CurrentConstant, ReadingsDamaged: see `ident.data.run_channels`.
         JointStill: a joint never moves in a run, and the fit has no usable number for that.
-        DataUnfit: two runs have one name; or see reduction.
+        DataUnfit: two runs have one name or the same samples; or see reduction.
         RankDeficient, TooFewMoves, PayloadUnseen, NotConverged: see reduction and estimators.
     """
     require_kind("model", model, Model, "write Model(robot, drive_train)")
-    names: set[tuple[str, str]] = set()
-    runs = each_run(runs, names)
+    seen = SeenRuns()
+    runs = each_run(runs, seen)
     if conditioning is None:
         runs = list(runs)
         conditioning = usual_conditioning(runs)
@@ -122,7 +122,7 @@ def identify(
     del standard  # its clusters hold every column
     with with_unit_causes(channels, model, axes), with_channel_causes(channels, axes):
         estimate = _checked_estimate(system, method, known_gains, axes, judge=judge)
-    left_out = each_run(holdout, names, system.payloads)
+    left_out = each_run(holdout, seen, system.payloads)
     left_out = with_signed_currents(left_out, model, conditioning, axes)
     built = rows_of_runs(model, left_out, conditioning)
     built = noting_channels(built, model, axes, [])
@@ -303,14 +303,13 @@ def keeping(
 
 
 def each_run(
-    runs: Iterable[Run], names: set[tuple[str, str]], payloads: tuple[Payload, ...] | None = None
+    runs: Iterable[Run], seen: SeenRuns, payloads: tuple[Payload, ...] | None = None
 ) -> Iterator[Run]:
     """Yield runs with a known mounting, or with any; refuse anything else.
 
     Args:
         runs: of a caller.
-        names: of the runs so far, to which theirs are added. No two may have one, unless they are
-            of different logs.
+        seen: the runs so far, to which these are added.
         payloads: with the known mountings; None where any is allowed.
     """
     require_kind("runs or holdout", runs, Iterable, "give a list: [bare, loaded]")
@@ -319,11 +318,7 @@ def each_run(
             "an entry of the runs", run, Run, "write Run(name, time_s, position_rad, current_a)"
         )
         require_named(run)
-        if (run.name, run.digest) in names:
-            raise DataUnfit(
-                run.name, "found two runs of this name; expected another name for each; rename one"
-            )
-        names.add((run.name, run.digest))
+        seen.add(run)
         if run.payload is not None and payloads is not None:
             mountings = {known.mounting for known in payloads}
             if run.payload.mounting not in mountings:

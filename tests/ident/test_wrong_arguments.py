@@ -477,6 +477,24 @@ def test_runs_of_different_logs_may_have_one_name(
     assert np.array_equal(same.estimate.gains, expected.estimate.gains)
 
 
+def test_a_recording_that_is_given_twice_is_refused_with_both_roles(
+    small_truth: Truth, short: tuple[ident.Run, ident.Run]
+) -> None:
+    """It would count twice, be held out of nothing, or be without load and loaded at once."""
+    bare, loaded = short
+    again = replace(bare, name="again")
+    as_loaded = replace(again, payload=loaded.payload)
+    words = r"run 'again': found the samples of run 'bare' \(without load\) in it, too \("
+    remedy = r"\); expected each recording once, .*; leave one of the two out"
+    model = small_truth.model
+    with pytest.raises(ident.DataUnfit, match=f"{words}without load{remedy}"):
+        ident.identify(model, [bare, again, loaded])
+    with pytest.raises(ident.DataUnfit, match=f"{words}without load{remedy}"):
+        ident.identify(model, short, holdout=[again])
+    with pytest.raises(ident.DataUnfit, match=f"{words}with payload 'disc'{remedy}"):
+        ident.identify(model, [bare, as_loaded])
+
+
 @pytest.mark.slow
 def test_a_method_may_be_named(small_truth: Truth, short: tuple[ident.Run, ident.Run]) -> None:
     for method in ident.Method:

@@ -37,12 +37,11 @@ from ident.discovery.joining import SetAside
 from ident.discovery.loop import find_effects
 from ident.discovery.search import (
     Finding,
-    effect_key,
     rank_effects,
     rank_families,
 )
 from ident.effects.dictionary import EFFECTS, GEOMETRY
-from ident.effects.effect import Effect, PlacedEffect
+from ident.effects.effect import Effect, PlacedEffect, effect_key
 from ident.effects.electrical import Lag
 from ident.effects.friction import NonlinearViscous, Stribeck, TemperatureFriction, WarmUp
 from ident.effects.position import Hinge, Spring

@@ -13,9 +13,8 @@ import pytest
 
 import ident
 from ident.arrays import FloatArray
-from ident.discovery.search import effect_key
 from ident.effects.dictionary import EFFECTS
-from ident.effects.effect import PlacedEffect, check_settings, columns_at, fits_data
+from ident.effects.effect import PlacedEffect, check_settings, columns_at, effect_key, fits_data
 from ident.effects.own import (
     SHIPPED,
     families_of,
@@ -233,15 +232,17 @@ class Given(SquareDrag):
     """Columns that a test gives."""
 
     name = "given"
-    given: Annotated[int, ident.Range(0, 2)] = 0
+    given: Annotated[int, ident.Range(0, 3)] = 0
 
     def columns(self, signals: ident.Signals, axis: int) -> FloatArray:
-        """Columns of another shape, with a number that is not finite, or right ones."""
+        """Columns of another shape, with a number that is not finite, complex, or right ones."""
         del signals, axis
         if self.given == 0:
             return np.zeros(SAMPLES)
         if self.given == 1:
             return np.array([[0.0, 1.0, np.nan, 0.0, 0.0]])
+        if self.given == 3:
+            return cast(FloatArray, 1j * np.ones((1, SAMPLES)))
         return cast(FloatArray, [[1] * SAMPLES])
 
 
@@ -266,6 +267,11 @@ def test_columns_of_an_effect_of_ones_own_are_checked() -> None:
         columns_at(given_effect, signals, 0)
     columns = columns_at(Given(given=2), signals, 0)
     assert np.array_equal(columns, np.ones((1, SAMPLES)))
+    with pytest.raises(
+        ident.EffectRefused,
+        match=r"`columns` of effect 'given' returns is of complex numbers .*; expected real ones",
+    ):
+        columns_at(Given(given=3), signals, 0)
 
 
 @dataclass(frozen=True, slots=True)
