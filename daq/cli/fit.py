@@ -24,6 +24,7 @@ from daq.cli.terminal import (
     print_view,
     replace_output,
     require_different,
+    require_folder_name,
     status,
 )
 from daq.cli.verb import (
@@ -129,6 +130,7 @@ class LogsRequest:
         check_folder(self.out)
         check_output(self.out, (*self.logs, *(self.holdout or ()), self.cell), CALIBRATION)
         require_different(self.out, report=report, pictures=self.pictures)
+        require_folder_name(self.pictures)
         check_report(report, self.out)
 
 

@@ -160,16 +160,21 @@ def make_folder(folder: Path) -> None:
     Raises:
         UsageError: a file, or a link that leads nowhere, has its name.
     """
-    if is_taken(folder) and not folder.is_dir():
+    require_folder_name(folder)
+    missing = [one for one in (folder, *folder.parents) if not one.exists()]
+    _MADE.extend(reversed(missing))
+    folder.mkdir(parents=True, exist_ok=True)
+
+
+def require_folder_name(folder: Path | None) -> None:
+    """Refuse, before any work, the name of a file or of a link that leads nowhere for a folder."""
+    if folder is not None and is_taken(folder) and not folder.is_dir():
         raise UsageError(
             str(folder),
             found=what_has_name(folder),
             expected="a folder, or a new name",
             remedy="choose another name, or move it away",
         )
-    missing = [one for one in (folder, *folder.parents) if not one.exists()]
-    _MADE.extend(reversed(missing))
-    folder.mkdir(parents=True, exist_ok=True)
 
 
 def remove_empty_folders() -> None:

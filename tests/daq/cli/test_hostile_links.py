@@ -306,6 +306,20 @@ def test_a_link_into_a_folder_that_is_not_there_is_refused_before_any_work(
     assert list(tmp_path.iterdir()) == [link]
 
 
+@pytest.mark.parametrize("verb", ["fit", "residual"])
+def test_pictures_under_the_name_of_a_link_to_nothing_are_refused_before_the_fit(
+    verb: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The log is not even there."""
+    link = tmp_path / "link"
+    link.symlink_to("gone")
+    log = str(tmp_path / "a.mcap")
+    report = str(tmp_path / "report")
+    words = [verb, log, "--report", report, "--pictures", str(link)]
+    assert main(words) == ExitCode.USAGE
+    assert "where nothing is" in capsys.readouterr().err
+
+
 def test_a_plan_for_a_folder_that_is_not_there_is_refused_before_the_planning(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
