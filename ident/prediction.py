@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from numbers import Real
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,9 +13,9 @@ from ident.arrays import (
     LARGEST_NUMBER,
     FloatArray,
     as_array,
+    as_float,
     require_entries,
     require_kind,
-    require_number,
     require_size,
     takes,
 )
@@ -489,47 +490,53 @@ def _coefficients_of(accepted: AcceptedEffect, placed: PlacedEffect) -> FloatArr
 
 
 def _gains(calibration: Calibration, model: Model) -> FloatArray:
+    """Gains of a calibration, shape (m,).
+
+    Raises:
+        ModelError: they are not as many as the model has axes, or see `_require_numbers`.
+    """
     count = model.robot.axis_count
-    require_entries("gains of the calibration", calibration.gains, Gain, FROM_CALIBRATION)
-    require_entries(
-        "parameters of the calibration", calibration.parameters, Parameter, FROM_CALIBRATION
-    )
-    require_entries(
-        "effects of the calibration", calibration.effects, AcceptedEffect, FROM_CALIBRATION
-    )
-    for parameter in calibration.parameters:
-        require_kind("name of a parameter", parameter.name, str, FROM_CALIBRATION)
-        label = f"parameter {parameter.name!r} of the calibration"
-        require_number(label, parameter.value, remedy=FROM_CALIBRATION)
-    gains = [gain.value for gain in calibration.gains]
+    _require_numbers(calibration)
+    gains = [float(gain.value) for gain in calibration.gains]
     if len(gains) != count:
         raise ModelError(f"the calibration has {len(gains)} gains, the model {count} joints")
-    found = as_array("gains of the calibration", gains, (count,), "one per axis")
-    _require_numbers(calibration)
-    return found
+    return np.array(gains)
 
 
 def _require_numbers(calibration: Calibration) -> None:
     """Refuse a calibration made by a program with numbers that predict none; files have none.
 
     Raises:
-        ModelError: a gain is zero, or a number is not finite or too large.
+        ModelError: a gain is zero, a number is none, or not finite, or too large.
     """
+    of_calibration = {
+        "gains": (calibration.gains, Gain),
+        "parameters": (calibration.parameters, Parameter),
+        "effects": (calibration.effects, AcceptedEffect),
+    }
+    for name, (entries, kind) in of_calibration.items():
+        require_entries(f"{name} of the calibration", entries, kind, FROM_CALIBRATION)
     for gain in calibration.gains:
+        name = f"gain of {gain.axis}"
+        require_kind(f"{name} of the calibration", gain.value, Real, FROM_CALIBRATION)
         if not 1.0 / LARGEST_NUMBER <= abs(gain.value) <= LARGEST_NUMBER:
-            raise _wrong_number(calibration, f"gain of {gain.axis}", gain.value)
+            raise _wrong_number(calibration, name, gain.value)
     parameters = list(calibration.parameters)
     for effect in calibration.effects:
         parameters.extend(effect.coefficients)
     for parameter in parameters:
+        require_kind("name of a parameter", parameter.name, str, FROM_CALIBRATION)
+        name = f"parameter {parameter.name}"
+        require_kind(f"{name} of the calibration", parameter.value, Real, FROM_CALIBRATION)
         if not abs(parameter.value) <= LARGEST_NUMBER:
-            raise _wrong_number(calibration, f"parameter {parameter.name}", parameter.value)
+            raise _wrong_number(calibration, name, parameter.value)
 
 
 def _wrong_number(calibration: Calibration, name: str, value: float) -> ModelError:
     """Error for a number of a calibration that no fit gives."""
+    found = as_float(value)
     return ModelError(
-        f"the calibration of cell {calibration.cell!r} has the {name} {value:g}; expected a number "
+        f"the calibration of cell {calibration.cell!r} has the {name} {found:g}; expected a number "
         f"of a fit, at most {LARGEST_NUMBER:g} in size, and no gain of zero; give the calibration "
         "as it was fitted or read"
     )

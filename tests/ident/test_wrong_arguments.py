@@ -951,7 +951,7 @@ WITH_ROBOT = lax.robot_from_urdf
         ),
         (
             lambda a: _predicted(a, gains=[replace(a["calibration"].gains[0], value=np.nan)] * 3),
-            "gains of the calibration holds 3 non-finite values",
+            "has the gain of J1 nan; expected a number",
         ),
         (
             lambda a: _predicted(a, effects=None),

@@ -1301,7 +1301,7 @@ def test_a_folder_that_holds_something_else_is_refused_before_any_work(
         assert text == "the user's own"
     occupied = tmp_path / "file"
     occupied.write_text("", encoding="utf-8")
-    with pytest.raises(OutputFailed, match="file"):
+    with pytest.raises(UsageError, match="found a file of that name; expected a folder"):
         check_report(occupied)
 
 
