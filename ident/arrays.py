@@ -175,7 +175,9 @@ def require_number(
     # A divisor may not be too small, either.
     is_too_small = above >= 0.0 and number < 1.0 / LARGEST_NUMBER
     if is_too_small or abs(number) > LARGEST_NUMBER:
-        sizes = f"{1.0 / LARGEST_NUMBER:g} to {LARGEST_NUMBER:g} in size"
+        sizes = f"at most {LARGEST_NUMBER:g} in size"
+        if above >= 0.0:
+            sizes = f"{1.0 / LARGEST_NUMBER:g} to {LARGEST_NUMBER:g} in size"
         raise ModelError(f"{label} is {number:g}; expected {bound}, {sizes}; {remedy}")
     return number
 

@@ -186,14 +186,14 @@ def external_torque(
     """
     if conditioning is None:
         conditioning = calibration.conditioning
+    if band is not None:
+        _require_band(band, model.robot.axis_count)
     residual = _residual(calibration, model, run, conditioning)
     from_itself = band is None
     left_out = 0
     if band is None:
         quiet, left_out = _quiet(residual)
         band = _band([quiet], ALARMS_PER_HOUR)
-    else:
-        _require_band(band, model.robot.axis_count)
     return ExternalTorque(
         time_s=residual.time_s,
         torque_nm=residual.torque_nm,

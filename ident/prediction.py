@@ -523,6 +523,8 @@ def _require_numbers(calibration: Calibration) -> None:
             raise _wrong_number(calibration, name, gain.value)
     parameters = list(calibration.parameters)
     for effect in calibration.effects:
+        label = f"coefficients of effect {effect.name!r} of the calibration"
+        require_entries(label, effect.coefficients, Parameter, FROM_CALIBRATION)
         parameters.extend(effect.coefficients)
     for parameter in parameters:
         require_kind("name of a parameter", parameter.name, str, FROM_CALIBRATION)

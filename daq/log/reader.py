@@ -244,8 +244,8 @@ class SampleChecks:
             step = f"{step_ns * 1e-9:.4g} s"
         if not 0 < step_ns < NO_LATE_SYNC_NS:
             remedy = (
-                "a recorder's stamps have one direction, whatever the clock of its computer: "
-                "another tool has changed the log; take the original, or record again"
+                "a recorder's stamps go on evenly, whatever the clock of its computer: another "
+                "tool has changed the log; take the original, or record again"
             )
         period_ms = period_ns * 1e-6
         found = self._steps[step_ns].format(step)

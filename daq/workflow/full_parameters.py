@@ -100,7 +100,8 @@ def require_prior(cell: Cell, urdf: str, name: str) -> None:
         name: of it, in messages.
 
     Raises:
-        UsageError: the robot has a closed chain, or the URDF has no inertia for one of its links.
+        UsageError: the robot has a closed chain or joints that follow others, or the URDF has no
+            inertia for one of its links.
         ConfigurationInconsistent: the URDF is of another robot.
         ModelError: the cell describes no robot.
     """

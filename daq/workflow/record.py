@@ -873,9 +873,9 @@ def _start_producer(
 
 
 def _pause_sync(producer: SyncProducer | None, network: CanopenNetwork) -> None:
-    """Stop SYNC until the recording's stream, and wait for the last answers.
+    """Stop a SYNC that the recording's stream starts anew, and wait for the last answers.
 
-    The stream starts SYNC again, at any time after the last one. Answers to that one must not come
+    The kernel's SYNC then comes at any time after its last one. Answers to that one must not come
     then: they would be taken for answers to the stream's first.
     """
     if producer is not None:

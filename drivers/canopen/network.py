@@ -32,10 +32,10 @@ from drivers.canopen.setup import (
     AxisSetup,
     HeartbeatGuard,
     Profiles,
-    insist,
     producer_of,
     read_consumers,
     refusal,
+    try_twice,
     why_no_heartbeat,
 )
 from drivers.canopen.split_bus import CellAddress, open_cell_bus
@@ -110,12 +110,13 @@ def _unrestored(axes: Sequence[Axis]) -> str:
     )
 
 
-def _attempt(step: Callable[[], object], problems: list[DriverError]) -> None:
+def _try_to_close(step: Callable[[], object], problems: list[DriverError]) -> None:
     """Do a step of closing; append its failure to the others, and go on."""
     try:
-        insist(step, problems)
+        try_twice(step, problems)
     except DriverError as problem:
-        problems.append(problem)
+        if str(problem) not in map(str, problems):
+            problems.append(problem)
 
 
 @contextmanager
@@ -645,13 +646,13 @@ class CanopenNetwork:
             axes = [axis for axis in axes if axis.node_id not in silent.node_ids]
         self.begin_stop(axes)
         for axis in axes:
-            _attempt(partial(self.disable, axis), problems)
+            _try_to_close(partial(self.disable, axis), problems)
         since_ns = self.link.clock()
         for axis in axes:
             stop_pdos = partial(
                 self.link.command_nmt, axis.node_id, NmtCommand.ENTER_PRE_OPERATIONAL
             )
-            _attempt(stop_pdos, problems)
+            _try_to_close(stop_pdos, problems)
         self.link.given_up = asked_again
         left: dict[str, tuple[str, ...]] = {}
         for axis in axes:
@@ -664,7 +665,7 @@ class CanopenNetwork:
                     since_ns,
                     left_s,
                 )
-                _attempt(confirm, problems)
+                _try_to_close(confirm, problems)
             left[axis.name] = self._setups[axis.node_id].restore(problems)
         if any(left.values()):
             if asked_again():

@@ -74,7 +74,7 @@ Consumers = tuple[tuple[ObjectEntry, int], ...]
 """Entries of 1016h and their values: node id of a heartbeat producer << 16 | time in ms."""
 
 
-def insist(step: Callable[[], object], problems: list[DriverError]) -> None:
+def try_twice(step: Callable[[], object], problems: list[DriverError]) -> None:
     """Do a step of closing a network, once more if the bus fails during it.
 
     A controller that goes off the bus, or the failure of one of several buses, is reported at any
@@ -564,7 +564,7 @@ class AxisSetup:
             if self._link.allowed_s(1.0) <= 0.0:
                 return (*unreached, *left)
             try:
-                insist(step, problems)
+                try_twice(step, problems)
             except BusError:
                 unreached.append(name)
             except DriverError as problem:

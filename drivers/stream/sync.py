@@ -39,7 +39,7 @@ FRAMES_PER_S = 50_000
 two full buses carry fewer.
 """
 STAMP_ERROR_NS = 1_000_000
-"""Largest error of a stamp; the kernel's are converted to another clock, to some tens of
+"""More than any error of a stamp: the kernel's are converted to another clock, to some tens of
 microseconds.
 """
 #: SYNCs ahead of the schedule that are too many; a late producer catches up with one or two

@@ -120,7 +120,7 @@ class Conditioning:
 
 
 def require_settings(conditioning: Conditioning) -> None:
-    """Refuse settings that are no numbers, and orders that no filter has.
+    """Refuse settings that are no numbers of their range, and orders that no filter has.
 
     Cut-offs are compared with the sampling rate of each run.
 

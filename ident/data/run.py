@@ -143,13 +143,14 @@ def require_named(run: Run) -> None:
 
 
 class SeenRuns:
-    """Runs of a fit so far. No two may have the same samples, or one name, unless they are of
-    different logs.
+    """Runs of a fit so far.
+
+    No two may have the same samples. Two may have one name if they are of different logs.
     """
 
     def __init__(self) -> None:
         self._names: set[tuple[str, str]] = set()
-        #: name and role of each run by the digest of its samples: the runs are not kept
+        #: name and load of each run by the digest of its samples: the runs are not kept
         self._by_content: dict[bytes, str] = {}
 
     def add(self, run: Run) -> None:
@@ -169,31 +170,37 @@ class SeenRuns:
         if content in self._by_content:
             raise DataUnfit(
                 run.name,
-                f"found the samples of run {self._by_content[content]} in it, too "
-                f"({_role_of(run)}); expected each recording once, in the fit or held out, with "
-                "the payload that was mounted; leave one of the two out",
+                f"found the same samples, {_load_text(run)}, as in run "
+                f"{self._by_content[content]}; expected each recording once, in the fit or held "
+                "out, with the payload that was mounted; leave one of the two out",
             )
-        self._by_content[content] = f"{run.name!r} ({_role_of(run)})"
+        self._by_content[content] = f"{run.name!r}, {_load_text(run)}"
 
 
-def _role_of(run: Run) -> str:
-    """What a run carries, in words."""
+def _load_text(run: Run) -> str:
+    """Say what was mounted during a run."""
     if run.payload is None:
         return "without load"
     return f"with payload {run.payload.name!r}"
 
 
 def _content_of(run: Run) -> bytes | None:
-    """Digest of the samples of a run; None where they are no arrays of numbers."""
+    """Digest of the samples of a run that count; None where they are no arrays of numbers.
+
+    One recording may be split into the fit and what is held out, by the samples that are valid.
+    """
     digest = blake2b()
-    for values in (run.position_rad, run.current_a):
+    parts: list[FloatArray | BoolArray] = [run.position_rad, run.current_a]
+    if run.valid is not None:
+        parts.append(run.valid)
+    for values in parts:
         try:
             array = np.asarray(values)
         except (TypeError, ValueError, OverflowError):
             return None
-        if array.dtype.kind not in "fiu":
+        if array.dtype.kind not in "fiub":
             return None
-        digest.update(array.tobytes())
+        digest.update(np.ascontiguousarray(array).data)
     return digest.digest()
 
 

@@ -46,7 +46,6 @@ from ident.estimators.identify import estimate_with
     steps=Sequence,
     gates=Gates | None,
     rng=np.random.Generator | None,
-    axes=Sequence,
 )
 def accept_on_holdout(
     start: Evidence,

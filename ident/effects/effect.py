@@ -553,7 +553,10 @@ def _own_columns(effect: Effect, signals: Signals, axis: int, count: int) -> Flo
         ) from error
     label = f"what the method `columns` of effect {effect.name!r} returns"
     require_real(label, returned, EffectRefused, "a torque for every sample")
-    found = np.asarray(returned, dtype=np.float64)
+    try:
+        found = np.asarray(returned, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise EffectRefused(f"{label}: found no numbers ({error})") from error
     ahead = _SHAPES.get(effect.side, (count,))
     expected = (*ahead, len(effect.coefficients), len(signals.time_s))
     if found.shape != expected:

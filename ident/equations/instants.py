@@ -36,7 +36,7 @@ class Instants:
     mounting: str | None  #: of the payload; None without load
 
     def require_axes(self, count: int) -> None:
-        """Refuse rows that are not of so many axes, or of several lengths.
+        """Refuse rows that are not of so many axes.
 
         Raises:
             ModelError: for a field of another type or shape.

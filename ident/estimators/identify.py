@@ -46,7 +46,7 @@ from ident.model.bodies import Payload
 from ident.model.model import Model
 
 
-@takes(method=Method | str, keep_rows=bool, judge=bool)
+@takes(method=Method | str, keep_rows=bool | np.bool_, judge=bool | np.bool_)
 def identify(
     model: Model,
     runs: Iterable[Run],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 from typing import TYPE_CHECKING, TypeVar
@@ -224,24 +225,25 @@ def require_described(robot: Robot) -> None:
         ModelError: a part is of another type or shape, no finite number, or names a joint that
             the robot does not have.
     """
-    _require_tuple("joints", robot.joints, Joint)
+    _require_parts("joints", robot.joints, Joint)
     if not robot.joints:
         raise ModelError("the robot has no joint; expected at least one; read it from a URDF")
     for index, joint in enumerate(robot.joints):
         _require_joint(joint, index)
     as_array("gravity_m_s2", robot.gravity_m_s2, (3,), "in the base frame [m/s²]")
     count = robot.joint_count
-    for motor in _require_tuple("motors", robot.motors, int):
+    require_kind("motors of the robot", robot.motors, Sequence, "give a tuple of joints' indices")
+    for motor in robot.motors:
         _require_index("an entry of motors", motor, count)
-    for closure in _require_tuple("closures", robot.closures, Closure):
+    for closure in _require_parts("closures", robot.closures, Closure):
         _require_place(f"first of closure {closure.name!r}", closure.first, count)
         _require_place(f"second of closure {closure.name!r}", closure.second, count)
-    for coupling in _require_tuple("couplings", robot.couplings, JointCoupling):
+    for coupling in _require_parts("couplings", robot.couplings, JointCoupling):
         _require_index("follower of a coupling", coupling.follower, count)
         _require_index("leader of a coupling", coupling.leader, count)
         require_number("multiplier of a coupling", coupling.multiplier)
         require_number("offset of a coupling", coupling.offset)
-    _require_tuple("pivots", robot.pivots, Pivot)
+    _require_parts("pivots", robot.pivots, Pivot)
     if robot.assembly_rad is not None:
         as_array("assembly_rad", robot.assembly_rad, (count,), "one position per joint")
     if robot.platform is not None:
@@ -251,10 +253,10 @@ def require_described(robot: Robot) -> None:
 Part = TypeVar("Part")
 
 
-def _require_tuple(name: str, values: tuple[Part, ...], kind: type[Part]) -> tuple[Part, ...]:
-    """Return the parts of a robot; refuse what is no tuple of them, as a `ModelError`."""
+def _require_parts(name: str, values: tuple[Part, ...], kind: type[Part]) -> tuple[Part, ...]:
+    """Return the parts of a robot; refuse what is no list of them, as a `ModelError`."""
     remedy = f"give a tuple of {kind.__name__}, or read the robot from a URDF"
-    require_kind(f"{name} of the robot", values, tuple, remedy)
+    require_kind(f"{name} of the robot", values, Sequence, remedy)
     require_entries(f"{name} of the robot", values, kind, remedy)
     return values
 

@@ -18,6 +18,7 @@ from xml.etree.ElementTree import Element, ParseError, fromstring, tostring
 import numpy as np
 
 from ident.arrays import (
+    LARGEST_NUMBER,
     FloatArray,
     as_array,
     require_entries,
@@ -658,7 +659,8 @@ def _position_limits(element: Element) -> tuple[float, float] | None:
         lower = float(limit.get("lower", ""))
     except ValueError:
         return None
-    if 0.0 < upper - lower < inf:
+    # Some exporters write the largest float where a joint has no limit.
+    if 0.0 < upper - lower <= LARGEST_NUMBER:
         return lower, upper
     return None
 

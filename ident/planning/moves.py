@@ -351,9 +351,9 @@ def _require_followers(robot: Robot, limits: JointLimits) -> None:
         first, last = beyond.axis_range
         raise ModelError(
             f"limits: joint {joint.name}, which follows {axis.name}, goes from "
-            f"{beyond.reached[0]:.4g} to {beyond.reached[1]:.4g} {unit}; expected {least:.4g} to "
-            f"{largest:.4g} {unit}, its limits in the URDF; give {axis.name} limits within "
-            f"{first:.4g} to {last:.4g}"
+            f"{beyond.reached[0]:.6g} to {beyond.reached[1]:.6g} {unit}; expected {least:.6g} to "
+            f"{largest:.6g} {unit}, its limits in the URDF; give {axis.name} limits within "
+            f"{first:.6g} to {last:.6g}"
         )
 
 

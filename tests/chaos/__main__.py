@@ -39,7 +39,7 @@ from tests.vcan.run import INTERFACE, OUT
 
 ATTEMPTS = 3
 """A round with violations is played again where the machine stood still meanwhile."""
-EXCUSABLE = ("(c)", "(d)", "(e)", "(listener)", "the simulated cell ended")
+EXCUSABLE = ("(c)", "(d)", "(e) exit code", "(listener)")
 
 
 def say(line: str) -> None:

@@ -492,6 +492,27 @@ def test_an_axis_without_limits_is_not_guessed_to_be_in_degrees(example: SimpleN
     assert [joint.travel for joint in joints] == [6.0, 6.0, 6.0]
 
 
+def test_the_largest_float_as_a_limit_is_none(example: SimpleNamespace) -> None:
+    """Some exporters of URDFs write it where a joint has no limit."""
+    urdf = example.URDF.replace('lower="-3"', 'lower="-3.4e38"').replace(
+        'upper="3"', 'upper="3.4e38"'
+    )
+    assert urdf != example.URDF
+    robot = ident.robot_from_urdf(urdf)
+    assert [joint.range for joint in robot.joints] == [None, None, None]
+    ident.Model(robot, ident.DriveTrain(np.diag(example.GEAR_RATIOS)))
+
+
+def test_a_robot_made_by_hand_takes_lists_and_whole_numbers_of_numpy(
+    example: SimpleNamespace,
+) -> None:
+    robot = ident.robot_from_urdf(example.URDF)
+    joints: Any = list(robot.joints)
+    motors: Any = tuple(np.arange(len(robot.joints)))
+    by_hand = replace(robot, joints=joints, motors=motors)
+    ident.Model(by_hand, ident.DriveTrain(np.diag(example.GEAR_RATIOS)))
+
+
 @pytest.mark.slow
 def test_exchanged_currents_name_the_function_that_tests_their_order(
     example: SimpleNamespace,

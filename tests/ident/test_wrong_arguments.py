@@ -484,15 +484,28 @@ def test_a_recording_that_is_given_twice_is_refused_with_both_roles(
     bare, loaded = short
     again = replace(bare, name="again")
     as_loaded = replace(again, payload=loaded.payload)
-    words = r"run 'again': found the samples of run 'bare' \(without load\) in it, too \("
-    remedy = r"\); expected each recording once, .*; leave one of the two out"
+    remedy = r"expected each recording once, .*; leave one of the two out"
+    first = r"as in run 'bare', without load"
+    words = rf"run 'again': found the same samples, without load, {first}; {remedy}"
     model = small_truth.model
-    with pytest.raises(ident.DataUnfit, match=f"{words}without load{remedy}"):
+    with pytest.raises(ident.DataUnfit, match=words):
         ident.identify(model, [bare, again, loaded])
-    with pytest.raises(ident.DataUnfit, match=f"{words}without load{remedy}"):
+    with pytest.raises(ident.DataUnfit, match=words):
         ident.identify(model, short, holdout=[again])
-    with pytest.raises(ident.DataUnfit, match=f"{words}with payload 'disc'{remedy}"):
+    with pytest.raises(ident.DataUnfit, match=rf"with payload 'disc', {first}; {remedy}"):
         ident.identify(model, [bare, as_loaded])
+
+
+def test_one_recording_may_be_split_into_fit_and_hold_out_by_its_valid_samples(
+    small_truth: Truth, short: tuple[ident.Run, ident.Run]
+) -> None:
+    bare, loaded = short
+    is_of_fit = np.arange(len(bare.time_s)) < len(bare.time_s) * 2 // 3
+    is_first = np.repeat(is_of_fit[:, None], bare.position_rad.shape[1], axis=1)
+    of_fit = replace(bare, valid=is_first)
+    held_out = replace(bare, name="the rest", valid=~is_first)
+    found = ident.identify(small_truth.model, [of_fit, loaded], holdout=[held_out])
+    assert found.holdout is not None
 
 
 @pytest.mark.slow
@@ -877,7 +890,7 @@ WITH_ROBOT = lax.robot_from_urdf
         ),
         (
             lambda a: ident.Model(replace(a["model"].robot, joints=None), DRIVE_TRAIN),
-            "joints of the robot is of type NoneType; expected tuple",
+            "joints of the robot is of type NoneType; expected Sequence",
         ),
         (
             lambda a: _planned(a, conditioning=lax.Conditioning(position_cutoff_hz="40")),
