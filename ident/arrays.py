@@ -21,6 +21,7 @@ Refusal = Callable[[str], Exception]
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
 LARGEST_NUMBER = 1e30  #: Size of a number, in any unit: products of three of them are still finite
+SMALLEST_NUMBER = 1e-30  #: Of a number that divides others
 
 
 def as_array(
@@ -173,11 +174,11 @@ def require_number(
     if not above < number < np.inf:
         raise ModelError(f"{label} is {number:g}; expected {bound}; {remedy}")
     # A divisor may not be too small, either.
-    is_too_small = above >= 0.0 and number < 1.0 / LARGEST_NUMBER
+    is_too_small = above >= 0.0 and number < SMALLEST_NUMBER
     if is_too_small or abs(number) > LARGEST_NUMBER:
         sizes = f"at most {LARGEST_NUMBER:g} in size"
         if above >= 0.0:
-            sizes = f"{1.0 / LARGEST_NUMBER:g} to {LARGEST_NUMBER:g} in size"
+            sizes = f"{SMALLEST_NUMBER:g} to {LARGEST_NUMBER:g} in size"
         raise ModelError(f"{label} is {number:g}; expected {bound}, {sizes}; {remedy}")
     return number
 

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from ident.arrays import (
     LARGEST_NUMBER,
+    SMALLEST_NUMBER,
     FloatArray,
     as_array,
     as_float,
@@ -519,7 +520,7 @@ def _require_numbers(calibration: Calibration) -> None:
     for gain in calibration.gains:
         name = f"gain of {gain.axis}"
         require_kind(f"{name} of the calibration", gain.value, Real, FROM_CALIBRATION)
-        if not 1.0 / LARGEST_NUMBER <= abs(gain.value) <= LARGEST_NUMBER:
+        if not SMALLEST_NUMBER <= abs(gain.value) <= LARGEST_NUMBER:
             raise _wrong_number(calibration, name, gain.value)
     parameters = list(calibration.parameters)
     for effect in calibration.effects:

@@ -35,7 +35,6 @@ from daq.errors import (
     LogsDiffer,
     UsageError,
 )
-from daq.files import sha256
 from daq.log.conversion import load_run
 from daq.log.reader import LossyLogs
 from daq.workflow.diagnoses import (
@@ -58,7 +57,7 @@ from daq.workflow.validate import Corrections, diagnose_log, with_described
 from ident.arrays import FloatArray
 from ident.calibration import Calibration, Source
 from ident.calibration import calibration_of as identified_calibration
-from ident.data.run import Run
+from ident.data.run import Run, content_digest
 from ident.data.torque_channel import TorqueChannel, TorqueSlope, torque_slope
 from ident.discovery.acceptance import accept_on_holdout
 from ident.discovery.before_after import compare_on_holdout, error_on
@@ -212,7 +211,7 @@ class LogLoader:
         self.sources: list[Source] = []
         self._first = first  #: read already
         self._read = read
-        self._seen: dict[str, Path] = {}
+        self._seen: dict[bytes | None, Path] = {}
         self._torques: list[tuple[TorqueChannel, ...]] = []
         self._positions: list[Positions] = []
         self._corrections = Corrections()
@@ -256,7 +255,7 @@ class LogLoader:
                 )
             self._corrections.note(log, run)
             # By its samples: a file that was rewritten is the same recording still.
-            content = sha256(run.position_rad.tobytes() + run.current_a.tobytes())
+            content = content_digest(run)
             if content in self._seen:
                 first_log = self._seen[content]
                 raise LogRepeated(

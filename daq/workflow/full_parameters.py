@@ -19,13 +19,9 @@ from ident.effects.effect import Property
 from ident.errors import ModelError
 from ident.estimators.estimate import Estimate
 from ident.estimators.method import Method
-from ident.model.robot import Joint, Robot
+from ident.model.robot import Joint
 from ident.model.urdf import read_urdf
-from ident.physical.full_parameters import (
-    FullParameters,
-    LinkPrior,
-    full_parameters,
-)
+from ident.physical.full_parameters import FullParameters, LinkPrior, full_parameters
 from ident.physical.full_set import FullParameter, FullSet, GainWithPrior
 from ident.physical.prior_check import PriorCheck
 
@@ -54,7 +50,7 @@ def full_set(fitted: Fit, urdf: str, name: str, tolerance: float) -> FullSet:
     """
     cell = fitted.cell
     _require_serial(cell)
-    links = _links_of(cell, fitted.identification.model.robot, urdf, name)
+    links = _links_of(cell, fitted.identification.model.robot.joints, urdf, name)
     prior = LinkPrior(links, tolerance)
     final = fitted.final
     effects = fitted.steps[-1].after.effects if fitted.steps else ()
@@ -64,7 +60,12 @@ def full_set(fitted: Fit, urdf: str, name: str, tolerance: float) -> FullSet:
     try:
         found = full_parameters(final.system, _with_std_by_moves(fitted), prior, friction)
     except ModelError as error:
-        raise _unfit_robot(error) from error
+        raise UsageError(
+            "--prior",
+            found=str(error),
+            expected="a serial robot with all of its base parameters",
+            remedy="fit without --prior and --prior-tolerance",
+        ) from error
     of_links = np.full(len(found.names), np.nan)
     of_links[final.model.link_columns] = links
     gains: tuple[GainWithPrior, ...] = ()
@@ -106,17 +107,7 @@ def require_prior(cell: Cell, urdf: str, name: str) -> None:
         ModelError: the cell describes no robot.
     """
     _require_serial(cell)
-    _links_of(cell, model_of(cell).robot, urdf, name)
-
-
-def _unfit_robot(error: ModelError) -> UsageError:
-    """Error for a robot or a fit whose standard parameters cannot be found."""
-    return UsageError(
-        "--prior",
-        found=str(error),
-        expected="a serial robot with all of its base parameters",
-        remedy="fit without --prior and --prior-tolerance",
-    )
+    _links_of(cell, model_of(cell).robot.joints, urdf, name)
 
 
 def require_std_by_moves(method: Method | None, *, gains_fixed: bool) -> None:
@@ -230,9 +221,8 @@ def _parameters(found: FullParameters, of_links: FloatArray) -> Iterator[FullPar
         )
 
 
-def _links_of(cell: Cell, robot: Robot, urdf: str, name: str) -> FloatArray:
-    """Links of a prior, shape (n, 10), of a URDF with the joints of a cell's robot."""
-    joints = robot.joints
+def _links_of(cell: Cell, joints: tuple[Joint, ...], urdf: str, name: str) -> FloatArray:
+    """Links of a prior, shape (n, 10), of a URDF with the joints of a cell."""
     try:
         found = read_urdf(urdf)
     except ModelError as error:

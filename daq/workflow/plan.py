@@ -884,7 +884,7 @@ def _require_followers(cell: Cell, targets: TargetBox) -> None:
         raise ConfigurationInconsistent(
             f"cell {cell.name}, limits of {axis.name}",
             found=f"joint {joint.name}, which follows it, from {_interval(unit, beyond.reached)}",
-            expected=f"{_interval(unit, joint.range or beyond.reached)}, its limits in the URDF",
+            expected=f"{_interval(unit, beyond.allowed)}, its limits in the URDF",
             remedy=f"give {axis.name} `limits` within {allowed}, or correct <limit> or <mimic> of "
             f"{joint.name} in the URDF",
         )
@@ -1212,7 +1212,7 @@ def _check_followers(path: Path, cell: Cell, moves: tuple[PlannedMove, ...]) -> 
             joint = beyond.joint
             unit = joint_unit(joint.kind)
             position, _ = beyond.reached
-            limits = _interval(unit, joint.range or beyond.reached)
+            limits = _interval(unit, beyond.allowed)
             raise _refused(
                 f"{path}: moves[{number}], {axis.name}",
                 f"joint {joint.name}, which follows it, at {unit.spell(position)}",

@@ -230,7 +230,7 @@ def apply(
     try:
         not_in_history = _complete_history(proposal, recorder)
     except BaseException as error:
-        # An interrupt: whoever reads of it must know that the write is done.
+        # Whoever reads of the interrupt must know that the write is done.
         error.add_note(f"kept: {_IN_PLACE.format(edit.subject)}")
         raise
     return replace(written, not_in_history=not_in_history)

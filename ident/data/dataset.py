@@ -64,7 +64,8 @@ SETTLED_PERIODS = 4.0
 LARGEST_JITTER = 0.01  #: Range of the steps of time, as a share of their median
 MEDIAN_OF_NORMAL = 0.6745  #: Median of |Z| of a standard normal Z
 #: Sizes of a current, in whatever unit, whose squares and their sums are exact enough
-SMALLEST_CURRENT, LARGEST_CURRENT = 1e-30, 1e30
+SMALLEST_CURRENT = 1e-30
+LARGEST_CURRENT = 1e30
 
 IN_SI = "give radians (metres for prismatic joints) and seconds"
 

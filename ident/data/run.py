@@ -164,7 +164,7 @@ class SeenRuns:
                 run.name, "found two runs of this name; expected another name for each; rename one"
             )
         self._names.add((run.name, run.digest))
-        content = _content_of(run)
+        content = content_digest(run)
         if content is None:
             return
         if content in self._by_content:
@@ -184,7 +184,7 @@ def _load_text(run: Run) -> str:
     return f"with payload {run.payload.name!r}"
 
 
-def _content_of(run: Run) -> bytes | None:
+def content_digest(run: Run) -> bytes | None:
     """Digest of the samples of a run that count; None where they are no arrays of numbers.
 
     One recording may be split into the fit and what is held out, by the samples that are valid.

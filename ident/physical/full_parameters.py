@@ -58,7 +58,6 @@ from ident.errors import ModelError
 from ident.estimators.estimate import Estimate
 from ident.model.bodies import link_parameters, pseudo_inertia
 from ident.model.model import Model
-from ident.model.robot import Robot
 from ident.physical.consistency import (
     MARGIN,
     NotPhysical,
@@ -328,19 +327,6 @@ def _solved(equations: _Equations, first: int) -> _Solution:
     )
 
 
-def require_serial(robot: Robot) -> None:
-    """Refuse a robot whose links move together, so that none has a mass of its own.
-
-    Raises:
-        ModelError: it has a closed chain, or joints that follow others.
-    """
-    if robot.is_constrained:
-        raise ModelError(
-            "the robot has a closed chain, or joints that follow others; expected a serial robot, "
-            "each joint with a motor: for links that move together no masses are computed"
-        )
-
-
 def _require_full(system: System, prior: LinkPrior) -> None:
     """Refuse robots and fits whose standard parameters cannot be found.
 
@@ -348,7 +334,11 @@ def _require_full(system: System, prior: LinkPrior) -> None:
         ModelError: as of `full_parameters`.
     """
     robot = system.model.robot
-    require_serial(robot)
+    if robot.is_constrained:
+        raise ModelError(
+            "the robot has a closed chain, or joints that follow others; expected a serial robot, "
+            "each joint with a motor: for links that move together no masses are computed"
+        )
     if len(prior.links) != robot.joint_count:
         raise ModelError(
             f"the prior has {len(prior.links)} moving links, the robot {robot.joint_count}; give "

@@ -25,7 +25,8 @@ class FollowerBeyond:
 
     axis: int  #: index of the axis that it follows
     joint: Joint  #: the follower
-    reached: tuple[float, float]  #: its least and largest position [rad or m]
+    allowed: tuple[float, float]  #: its least and largest position in the URDF [rad or m]
+    reached: tuple[float, float]  #: those that it reaches [rad or m]
     #: positions of the axis at which it keeps its limits, the least and the largest [rad or m]
     axis_range: tuple[float, float]
 
@@ -44,6 +45,9 @@ def followers_beyond(
         joint = robot.joints[coupling.follower]
         if joint.range is None or coupling.multiplier == 0.0:
             continue
+        if coupling.leader not in robot.axis_joints:
+            # A loop moves it: where it goes is not known by the limits of an axis.
+            continue
         least, largest = joint.range
         axis = robot.axis_joints.index(coupling.leader)
         ends = (lower[axis], upper[axis])
@@ -55,6 +59,7 @@ def followers_beyond(
         beyond = FollowerBeyond(
             axis=axis,
             joint=joint,
+            allowed=joint.range,
             reached=(float(min(reached)), float(max(reached))),
             axis_range=(min(of_axis), max(of_axis)),
         )

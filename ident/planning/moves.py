@@ -347,7 +347,7 @@ def _require_followers(robot: Robot, limits: JointLimits) -> None:
         unit = "rad"
         if joint.kind is JointKind.PRISMATIC:
             unit = "m"
-        least, largest = joint.range or beyond.reached
+        least, largest = beyond.allowed
         first, last = beyond.axis_range
         raise ModelError(
             f"limits: joint {joint.name}, which follows {axis.name}, goes from "

@@ -17,6 +17,7 @@ import pytest
 import ident
 from ident.arrays import FloatArray
 from ident.planning.effort import EFFORT_MARGIN, effort_shares
+from ident.planning.limits import followers_beyond
 from ident.planning.moves import DWELL_S, FEWEST_MOVES, MAX_TRIES, _random_moves, _search_of
 from tests.ident.mechanisms import FIVE_BAR
 
@@ -454,3 +455,16 @@ def test_a_move_takes_as_long_as_least_jerk_within_the_slowest_limit(model: iden
         velocity_shares, acceleration_shares = _limit_shares(motion)
         largest_share = max(velocity_shares.max(), acceleration_shares.max())
         assert largest_share == pytest.approx(1.0, rel=1e-5)
+
+
+def test_a_follower_of_a_joint_without_a_motor_is_not_judged_by_an_axis() -> None:
+    model, _ = _belted(None)
+    robot = model.robot
+    follower = replace(robot.joints[2], lowest=-0.5, travel=1.0)
+    by_a_loop = replace(robot, joints=(*robot.joints[:2], follower), motors=(0,))
+    reach = np.array([2.0])
+    assert followers_beyond(by_a_loop, -reach, reach) == ()
+    driven = replace(by_a_loop, motors=(0, 1))
+    both = np.array([2.0, 2.0])
+    (beyond,) = followers_beyond(driven, -both, both)
+    assert beyond.allowed == (-0.5, 0.5)
