@@ -27,9 +27,11 @@ def defer_full_gc() -> Iterator[None]:
 
     A search through all that the program and its libraries have made takes tens of milliseconds, in
     which nothing else of the process runs: so many periods without SYNC at 1 kHz, and a run that is
-    marked invalid.
+    marked invalid. So what there is already is searched now, once: it would all be part of the
+    first search of the middle generation, which comes after a minute of recording.
     """
     before = gc.get_threshold()
+    gc.collect()
     # Python's own limits for young objects, which the command line raises: each of these searches
     # takes microseconds.
     gc.set_threshold(700, 10, NEVER)

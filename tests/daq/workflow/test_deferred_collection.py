@@ -34,6 +34,7 @@ def test_full_collections_are_deferred_and_young_ones_are_not() -> None:
     gc.callbacks.append(note)
     try:
         with defer_full_gc():
+            collected.clear()
             fresh = weakref.ref(Ring())
             kept = [[number] for number in range(enough)]
         assert fresh() is None
@@ -45,6 +46,30 @@ def test_full_collections_are_deferred_and_young_ones_are_not() -> None:
     finally:
         gc.callbacks.remove(note)
         gc.set_threshold(*limits)
+
+
+def test_what_was_made_before_is_not_searched_again_in_the_block() -> None:
+    searched: list[int] = []
+
+    def note(phase: str, reported: dict[str, int]) -> None:
+        if phase == "start" and reported["generation"] == 1:
+            young = len(gc.get_objects(generation=0)) + len(gc.get_objects(generation=1))
+            searched.append(young)
+
+    limits = gc.get_threshold()
+    gc.set_threshold(20_000, 50, 100)  # those of the command line
+    before = [[number] for number in range(100_000)]
+    gc.callbacks.append(note)
+    try:
+        with defer_full_gc():
+            searched.clear()
+            kept = [[number] for number in range(30_000)]
+        assert searched
+        assert max(searched) < 10_000
+    finally:
+        gc.callbacks.remove(note)
+        gc.set_threshold(*limits)
+    assert len(before) + len(kept) == 130_000
 
 
 def test_a_run_that_fails_leaves_everything_as_it_was() -> None:
