@@ -154,19 +154,15 @@ def apply_verb(options: ApplyOptions) -> None:
         content=content,
     )
     audit = audit_of(declared, (options.cell, options.calibration, options.to))
-    undo = f"drivegain rollback {shlex.quote(str(options.cell))}"
     opening: AbstractContextManager[Target[Any]]
     interrupts: AbstractContextManager[Any]
     whole: AbstractContextManager[None]
     if options.drives:
         at_most_one(drives=True, to=options.to)
-        undo += " --drives"
         opening = drives_on_the_bus(declared, saving)
         interrupts = nullcontext()  # `drives_on_the_bus` handles them
         whole = nullcontext()
     else:
-        if options.to is not None:
-            undo += f" --to {shlex.quote(str(options.to))}"
         opening = nullcontext(FileTarget.of(declared, options.to))
         interrupts = interruptible()
         whole = delay_signals()
@@ -177,11 +173,26 @@ def apply_verb(options: ApplyOptions) -> None:
             request,
             actor=actor,
             audit=audit,
-            undo=undo,
+            undo=rollback_command(options),
             yes=options.yes,
             json=options.json,
             whole=whole,
         )
+
+
+def rollback_command(options: ApplyOptions) -> str:
+    """Command that undoes the write: of a file at once, of drives with the same way of saving."""
+    words = ["drivegain", "rollback", str(options.cell)]
+    if options.drives:
+        words.append("--drives")
+        if options.ram_only:
+            words.append("--ram-only")
+        if options.save_unknown:
+            words.append("--save-unknown")
+        words.append("--yes")
+    elif options.to is not None:
+        words += ["--to", str(options.to)]
+    return shlex.join(words)
 
 
 def apply_to(

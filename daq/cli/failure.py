@@ -85,7 +85,7 @@ ADVICE: dict[type[Exception], tuple[str, str]] = {
     ),
     driver.ParametersMixed: (
         "all drives with their previous values, or all with the new ones",
-        "`drivegain rollback CELL --drives` before an axis is enabled",
+        "`drivegain rollback CELL --drives --yes` before an axis is enabled",
     ),
     driver.SampleLost: (
         "an answer from every axis to every SYNC",

@@ -100,5 +100,6 @@ def _copy(source: str, path: Path, name: str, texts: dict[str, Any]) -> Path:
         text = text.replace("pacing: lockstep", "pacing: timed   ").replace(
             "unit: Nm(motor, a priori)", "unit: A"
         )
+        text = text.replace("\nsync:\n  period_us: 1000\n", f"\n{texts['sync']}")
         path.write_text(text, encoding="utf-8")
     return path

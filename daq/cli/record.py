@@ -92,7 +92,8 @@ def record_verb(options: RecordOptions) -> None:
     out = options.out
     part = _free(out)
     not_weighed = carried is not None and options.mass is None
-    for line in _before_motion(declared, options.plan, not_weighed):
+    before_motion = list(_before_motion(declared, options.plan, not_weighed))
+    for line in before_motion:
         say(line, err=True)
     request = RecordingRequest(
         options.cell,
@@ -130,7 +131,8 @@ def record_verb(options: RecordOptions) -> None:
         _add_what_is_kept(error, declared, part)
         raise
     for warning in done.warnings:
-        say(warning, err=True)
+        if warning not in before_motion:
+            say(warning, err=True)
     if options.json:
         print_json(record_report(out, done, declared))
     else:
@@ -178,6 +180,7 @@ def _add_what_is_kept(error: DriverError, cell: Cell, part: Path) -> None:
 
 def _before_motion(cell: Cell, plan: Path, not_weighed: bool) -> Iterator[str]:
     """Remarks for a person before the axes move."""
+    from daq.config.cell_buses import load_warnings
     from daq.report.bus_views import load_lines
     from daq.report.plan_preview import find_preview
 
@@ -189,6 +192,7 @@ def _before_motion(cell: Cell, plan: Path, not_weighed: bool) -> Iterator[str]:
     if (page := find_preview(plan)) is not None:
         yield f"preview of these moves: {page}"
     yield from load_lines(cell)
+    yield from load_warnings(cell)
 
 
 def _free(out: Path) -> Path:

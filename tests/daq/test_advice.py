@@ -51,7 +51,7 @@ def test_a_misplaced_node_names_the_scan() -> None:
 
 def test_mixed_parameters_name_the_rollback() -> None:
     parameters_mixed = ParametersMixed(("J1",), ("J2: silent",))
-    assert ("`drivegain rollback CELL --drives`") in ErrorParts.of(parameters_mixed).do
+    assert ("`drivegain rollback CELL --drives --yes`") in ErrorParts.of(parameters_mixed).do
 
 
 def test_a_payload_that_is_not_seen_is_looked_for_in_every_run_before_a_heavier_one_is_advised() -> (  # noqa: E501

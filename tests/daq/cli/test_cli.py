@@ -21,6 +21,7 @@ from daq.cli.app import ALIASES, BY_JOB, VERBS
 from daq.cli.terminal import say_written, show_steps
 from daq.cli.verb import Job, Verb, cell_here, cells_in, continued
 from daq.config.cell import PacingMode
+from daq.config.cell_buses import load_warnings
 from daq.config.cell_file import load_cell
 from daq.config.import_description import load_import
 from daq.documents.calibration_file import save_calibration
@@ -501,6 +502,15 @@ def test_init_for_the_simulated_cell_changes_bus_and_sampling_alone(tmp_path: Pa
     assert cell.sync.pacing is PacingMode.LOCKSTEP
     one, other = (yaml.safe_load(path.read_text(encoding="utf-8")) for path in (real, simulated))
     assert {key for key in one if one[key] != other[key]} == {"bus", "sync"}
+
+
+def test_the_bus_of_a_new_cell_has_room_for_the_start_of_a_move(tmp_path: Path) -> None:
+    folder = tmp_path / "press-4"
+    assert run_verb("init", folder) == 0
+    cell = load_cell(folder / "cells/press-4.yaml")
+    assert cell.sync is not None
+    assert cell.sync.pacing is PacingMode.TIMED
+    assert load_warnings(cell) == ()
 
 
 def test_init_overwrites_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

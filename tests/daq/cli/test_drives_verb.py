@@ -6,11 +6,12 @@ import hashlib
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import typer
 
-from daq.cli.apply import rollback_drives, saving_of
+from daq.cli.apply import ApplyOptions, rollback_command, rollback_drives, saving_of
 from daq.config.cell import Cell
 from daq.documents.calibration_file import encode_calibration
 from daq.errors import BusTaken, CalibrationRefused, UsageError
@@ -218,3 +219,27 @@ def test_the_two_options_of_saving() -> None:
     assert [saving_of(False, False), saving_of(True, False), saving_of(False, True)] == expected
     with pytest.raises(UsageError, match="one of them"):
         saving_of(True, True)
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        ({}, "drivegain rollback press.yaml"),
+        ({"to": Path("a copy.xml")}, "drivegain rollback press.yaml --to 'a copy.xml'"),
+        ({"drives": True}, "drivegain rollback press.yaml --drives --yes"),
+        (
+            {"drives": True, "ram_only": True},
+            "drivegain rollback press.yaml --drives --ram-only --yes",
+        ),
+        (
+            {"drives": True, "save_unknown": True},
+            "drivegain rollback press.yaml --drives --save-unknown --yes",
+        ),
+    ],
+)
+def test_the_command_to_undo_a_write_undoes_it_as_it_is_printed(
+    given: dict[str, Any], expected: str
+) -> None:
+    """A rollback of drives without --yes only shows, and saves as it is told to."""
+    options = ApplyOptions(Path("press.yaml"), Path("calibration.yaml"), yes=True, **given)
+    assert rollback_command(options) == expected

@@ -10,6 +10,8 @@ from typing import NoReturn
 import pytest
 
 from daq.cli.app import main
+from daq.config.cell_buses import load_warnings
+from daq.config.cell_file import load_cell
 from daq.errors import ExitCode
 from daq.log.metadata import RunStatistics
 from daq.workflow.record import Recorded
@@ -80,6 +82,30 @@ def test_a_recording_with_losses_is_reported_and_is_no_success(
     assert run_verb(*command, "--json") == code
     document = json.loads(capsys.readouterr().out)
     assert document["valid"] is valid
+
+
+def test_a_bus_without_room_for_the_start_of_a_move_is_said_once_before_the_axes_move(
+    cells: dict[str, str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    said_before: list[str] = []
+    counted = RunStatistics(1000, 0, (0,) * 6, True, "")
+    warnings = (*load_warnings(load_cell(Path(cells["timed"]))), "another warning")
+
+    def recorded(*_: object, **__: object) -> Recorded:
+        said_before.append(capsys.readouterr().err)
+        return Recorded(tmp_path / "a.mcap", counted, StreamStatistics(), warnings)
+
+    monkeypatch.setattr("daq.workflow.record.record", recorded)
+    command = ["record", cells["timed"], "plan.yaml", "--out", str(tmp_path / "a.mcap")]
+    assert main([*command, "--enable-motion", "--json"]) == ExitCode.OK
+    after = capsys.readouterr().err
+    (before,) = said_before
+    assert "set-points and answers take 137 % of a period" in before
+    assert "137 %" not in after
+    assert "another warning" in after
 
 
 @pytest.mark.parametrize("name", ["run.mcap", "my run.mcap"])

@@ -164,6 +164,12 @@ def test_what_yaml_allows_and_a_configuration_must_not(text: str, line: str, fou
     assert "Node(" not in str(caught.value)
 
 
+def test_a_tab_before_a_comment_is_read() -> None:
+    """A tab indents nothing there (YAML 1.2, 6.6)."""
+    document = parse_yaml(b"bus:\t# the left one\n  channel: can0\t\t# tabs\n", "cell.yaml")
+    assert document.tree == {"bus": {"channel": "can0"}}
+
+
 def _patterns(schema: object) -> Iterator[str]:
     """Yield each pattern of a text in a JSON schema."""
     if isinstance(schema, dict):

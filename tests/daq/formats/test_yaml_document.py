@@ -142,6 +142,14 @@ def test_a_number_that_cannot_be_changed_alone_is_refused(text: str, key: str, s
     assert "robot.yaml" in str(caught.value)
 
 
+@pytest.mark.parametrize(("text", "value"), [("032.96", 32.96), ("-010.5", -10.5), ("0.5", 0.5)])
+def test_a_leading_zero_before_a_decimal_point_changes_no_number(text: str, value: float) -> None:
+    """Of whole numbers alone readers differ: `034` is octal to some."""
+    (scalar,) = YamlDocument("robot.yaml", f"g: {text}").locate(("g",))
+    assert scalar.value == value
+    assert float(yaml.safe_load(f"g: {text}")["g"]) == value
+
+
 @pytest.mark.parametrize(
     "text",
     ["g: !!float 7", "g: !<tag:yaml.org,2002:float> 7", "g: &x !!float '7'", "g: 0", "g: 0.5"],

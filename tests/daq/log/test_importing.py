@@ -1283,6 +1283,17 @@ def test_the_shipped_description_shows_every_setting(checkout: Path) -> None:
         assert document.tree[key].keys() == expected, key
 
 
+def test_a_shipped_description_says_where_its_recordings_are_from(checkout: Path) -> None:
+    """The recordings are not shipped."""
+    descriptions = sorted((checkout / "configs/imports").glob("*.yaml"))
+    assert descriptions
+    for path in descriptions:
+        head = re.match(r"(#.*\n)+", path.read_text(encoding="utf-8"))
+        assert head is not None, path
+        assert "repository" in head[0], path
+        assert "License" in head[0], path
+
+
 def test_an_import_without_them_has_neither(inputs: ImportInputs) -> None:
     assert inputs.run() == 0
     run, _ = load_run(inputs.out)

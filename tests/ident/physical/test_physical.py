@@ -309,6 +309,8 @@ def test_the_prior_is_the_urdf_or_a_ball() -> None:
         ('mass value="10.0"', 'mass value="1e20"'),
         ('mass value="10.0"', 'mass value="-1e20"'),
         ('mass value="10.0"', 'mass value="1e-320"'),
+        ('mass value="10.0"', 'mass value="-1"'),
+        ('mass value="10.0"', 'mass value="nan"'),
         ('ixx="0.05"', 'ixx="1e308"'),
         ('xyz="0 0.02 -0.04"', 'xyz="0 1e200 -0.04"'),
     ],
