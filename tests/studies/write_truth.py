@@ -92,6 +92,11 @@ def _subject_not_begun(found: re.Match[str], facts: Facts) -> bool:
     return any(path.is_relative_to(subject) for path in facts.not_made)
 
 
+def _note_not_made(found: re.Match[str], facts: Facts) -> bool:
+    """Hold where a change of the note was begun and not made."""
+    return Path(found["note"]) in facts.not_made
+
+
 def _written_with_path(found: re.Match[str], facts: Facts) -> bool:
     path = Path(found["backup"])
     backup = facts.after.get(path)
@@ -138,6 +143,11 @@ RULES = (
     Rule(r"written to the controller's file: file \S+, backup (?P<backup>\S+)", _written_with_path),
     Rule(r"certified: id \w+, written on", _is_new),
     Rule(r"certified: id \w+, not written", lambda _, facts: not facts.has_write),
+    Rule(
+        r"the digest of the last entry cannot be noted in (?P<note>\S+) \([^)]*\): a missing end "
+        r"of the audit log would not be noticed; [^;]*, and the next entry is noted again",
+        _note_not_made,
+    ),
     Rule(r"metrics could not be written", _is_any),
     Rule(r"lost cycles \d+", _is_any),
     Rule(r"`drivegain history CELL --add CALIBRATION` enters it", _is_any),

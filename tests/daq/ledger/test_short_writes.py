@@ -133,3 +133,27 @@ def test_a_file_whose_folder_cannot_be_flushed_is_not_called_as_it_was(
     assert path.read_text() == "new"
     with pytest.raises(OutputFailed, match="it is as it was"), writing(tmp_path):
         replace_file(tmp_path, b"new")
+
+
+@pytest.mark.parametrize("failing", ["ftruncate", "pwrite"])
+def test_a_note_is_said_to_be_lacking_where_it_is(
+    failing: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    audit = tmp_path / "audit.jsonl"
+    _append(audit, "before")
+
+    def fail(*_: object) -> None:
+        raise OSError(errno.EIO, "Input/output error")
+
+    # The length of the note is set after all of it was taken.
+    with monkeypatch.context() as patched:
+        patched.setattr(os, failing, fail)
+        entry = _append(audit, "after")
+    is_noted = noted_heads(audit)[-1] == entry.sha256
+    assert is_noted == (failing == "ftruncate")
+    said = [record.getMessage() for record in caplog.records]
+    assert len(said) == (0 if is_noted else 1)
+    assert is_noted or "cannot be noted" in said[0]

@@ -295,6 +295,19 @@ def test_a_backup_that_is_named_must_have_the_old_content() -> None:
     assert false_sentences(said, facts) != ()
 
 
+def test_a_note_that_is_said_to_be_lacking_was_not_made() -> None:
+    note = Path("/cell/a.jsonl.head")
+    said = (
+        f"the digest of the last entry cannot be noted in {note} (input/output error): a missing "
+        "end of the audit log would not be noticed; free space or rights, and the next entry is "
+        "noted again"
+    )
+    made = _facts(Content.NEW)
+    assert len(false_sentences(said, made)) == 1
+    not_made = replace(made, not_made=frozenset((note,)))
+    assert false_sentences(said, not_made) == ()
+
+
 def test_a_claim_that_no_rule_judges_is_a_finding() -> None:
     facts = _facts(Content.OLD)
     assert false_sentences("The moon was restored.", facts) != ()
