@@ -354,9 +354,9 @@ class OutputFailed(DaqError):
                 remedy="it is as it was; ask who set the mark and why, take it off "
                 f"(`chattr -i -a {shlex.quote(str(error.marked))}`), then repeat the command",
             )
-        missing = cls.of_missing_folder(path, error)
-        if missing is not None:
-            return missing
+        no_folder = cls._of_file_in_the_way(path) or cls.of_missing_folder(path, error)
+        if no_folder is not None:
+            return no_folder
         if error.errno == errno.ENAMETOOLONG:
             return cls(
                 str(path),
@@ -371,6 +371,21 @@ class OutputFailed(DaqError):
             expected="a folder that can be written, with room",
             remedy="it is as it was; free space or rights, or choose another folder",
         )
+
+    @classmethod
+    def _of_file_in_the_way(cls, path: Path) -> OutputFailed | None:
+        """Make the error for an output below a file; None where each folder above it is one."""
+        for above in path.parents:
+            if above.is_dir():
+                return None
+            if above.exists():
+                return cls(
+                    str(path),
+                    found=f"{above} is a file",
+                    expected="folders alone above the output",
+                    remedy="nothing was written; choose another folder",
+                )
+        return None
 
     @classmethod
     def of_missing_folder(cls, path: Path, error: OSError) -> OutputFailed | None:

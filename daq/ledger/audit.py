@@ -310,7 +310,10 @@ def note_obstacle(path: Path) -> str:
     try:
         os.close(_open_note(path))
     except FileNotFoundError:
-        return ""  # it will be made
+        # It will be made, where its folder takes a file.
+        if not os.access(head_file(path).parent, os.W_OK):
+            refused = OSError(errno.EACCES, "no file can be made in its folder")
+            return _says_not_noted(path, refused)
     except OSError as error:
         return _says_not_noted(path, error)
     return ""

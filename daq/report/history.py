@@ -160,6 +160,10 @@ class AuditReport(Report):
     flaws: list[FlawedLine]
     torn_lines: list[int]
     """left by a writer that was killed; they are no flaw"""
+    noted: bool
+    """the digest of the last entry is noted next to the audit log: a missing end would show"""
+    not_noted: str | None
+    """why the next entry cannot be noted either"""
     open_writes: list[UnendedWrite]
     history_broken: list[str]
     """what the history cannot show"""
@@ -471,6 +475,8 @@ def audit_report(found: Verification) -> AuditReport:
         entries=len(verdict.entries),
         broken_line=verdict.broken,
         torn_lines=verdict.torn,
+        noted=found.noted,
+        not_noted=printable(found.note_obstacle) or None,
         open_writes=open_writes,
         history_broken=[printable(one) for one in found.broken],
         unknown_writes=unknown_writes,

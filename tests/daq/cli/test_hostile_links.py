@@ -339,6 +339,31 @@ def test_a_folder_of_pictures_that_is_a_link_to_nothing_is_called_that(tmp_path:
         make_folder(tmp_path / "file")
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["init", "file/below/x.yaml"],
+        ["sign", "key", "--name", "anna", "--no-password", "--folder", "file/below"],
+    ],
+    ids=["init", "sign key"],
+)
+def test_an_output_below_a_file_is_refused_with_the_name_of_the_file(
+    words: list[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """It was "not a directory … free space or rights"."""
+    monkeypatch.chdir(tmp_path)
+    file = tmp_path / "file"
+    file.touch()
+    assert main(words) != ExitCode.OK
+    said = " ".join(capsys.readouterr().err.split())
+    assert "found: file is a file" in said
+    assert "free space" not in said
+    assert list(tmp_path.iterdir()) == [file]
+
+
 #: Words of a verb before the name of its output
 WRITING = {
     "certificate": ["certificate", "calibration.yaml", "--out"],

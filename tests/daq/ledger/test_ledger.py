@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import multiprocessing
 import os
 import random
@@ -591,6 +592,10 @@ def test_an_entry_that_cannot_be_noted_is_said_once_by_each_verb(
         printed = " ".join(capsys.readouterr().out.split())
         assert "NOT NOTED: the digest of the last entry cannot be noted in" in printed
         assert "The next entry writes it again" not in printed
+        assert run_verb("history", cell_file, "--verify", "--json") == ExitCode.OK
+        audit = json.loads(capsys.readouterr().out)["audit"]
+        assert audit["noted"] is False
+        assert "cannot be noted in" in audit["not_noted"]
 
 
 def test_a_path_that_is_not_utf_8_is_in_the_history(

@@ -11,7 +11,15 @@ import pytest
 
 from daq.errors import OutputFailed, WriteUnconfirmed, writing
 from daq.files import replace_file
-from daq.ledger.audit import AuditAction, AuditEntry, append, head_file, noted_heads, verify
+from daq.ledger.audit import (
+    AuditAction,
+    AuditEntry,
+    append,
+    head_file,
+    note_obstacle,
+    noted_heads,
+    verify,
+)
 from daq.ledger.ledger import record_session
 
 NOW = datetime(2026, 1, 5, 6, 0, tzinfo=UTC)
@@ -157,3 +165,15 @@ def test_a_note_is_said_to_be_lacking_where_it_is(
     said = [record.getMessage() for record in caplog.records]
     assert len(said) == (0 if is_noted else 1)
     assert is_noted or "cannot be noted" in said[0]
+
+
+def test_a_note_that_is_not_there_needs_a_folder_that_takes_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    audit = tmp_path / "audit.jsonl"
+    _append(audit)
+    head_file(audit).unlink()
+    assert note_obstacle(audit) == ""
+    # Root may write everywhere but on a disk that is mounted read-only.
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    assert "no file can be made in its folder" in note_obstacle(audit)
