@@ -89,7 +89,7 @@ def compare(
     for own in _all_alignments(
         log, frames, nodes, syncs, times_ns, foreign, same_sync_ns, in_order, clock_steps_ns
     ):
-        found = _compare(log, frames, nodes, syncs, own, foreign, in_order)
+        found = _compare(log, frames, nodes, syncs, own, foreign, in_order, best)
         if best is None or found.badness < best.badness:
             best = found
         if best.badness == (0, 0):
@@ -210,11 +210,17 @@ def _compare(
     own: Sequence[int],
     foreign: set[int],
     in_order: bool,
+    best: Comparison | None,
 ) -> Comparison:
+    """Compare a log with the frames where its samples have these SYNCs;
+    only so far until it is no better than the best one.
+    """
     found = Comparison(len(log.cycle), syncs=[_place_of(place, syncs) for place in own])
     say = found.violations.append
     doubtful = in_order and (log.valid is None or TWICE in log.reason)
     for number, place in enumerate(own):
+        if best is not None and found.badness >= best.badness:
+            return found
         name = f"cycle {log.cycle[number]}"
         if place < 0 or (number and place <= own[number - 1]):
             say(f"{name}: no SYNC of its own on the bus at its time")
