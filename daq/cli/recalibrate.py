@@ -143,7 +143,7 @@ def schedule_verb(
     """
     from daq.jobs.context import section_of
     from daq.jobs.gain_target import file_of
-    from daq.jobs.units import Installation, cell_option, cron_line, next_commands, units_of
+    from daq.jobs.units import Installation, cron_line, next_commands, units_of
 
     declared = read_cell(cell)
     section = section_of(declared)
@@ -163,9 +163,7 @@ def schedule_verb(
     folder = to or (Path.home() / _OF_USER if user else _SYSTEM)
     units = units_of(declared, section, wanted)
     for unit in units:
-        require_own_unit(
-            folder / unit.name, cell_option(wanted) if unit.name.endswith(".service") else ""
-        )
+        require_own_unit(folder / unit.name, place)
     if yes:
         with writing(folder):
             folder.mkdir(parents=True, exist_ok=True)
@@ -230,11 +228,9 @@ def check_schedule(schedule: str) -> None:
         )
 
 
-def require_own_unit(path: Path, option: str = "") -> None:
-    """Refuse to replace a file that this verb did not write,
-    or a unit without the option of this cell.
-    """
-    from daq.jobs.units import MARKS
+def require_own_unit(path: Path, cell_file: Path) -> None:
+    """Refuse to replace a file that this verb did not write, or a service of another cell file."""
+    from daq.jobs.units import MARKS, is_service_of
 
     with writing(path):
         # Reading a pipe would block; only a regular file can be a unit of ours.
@@ -249,9 +245,9 @@ def require_own_unit(path: Path, option: str = "") -> None:
     if text is None or not text.startswith(MARKS):
         found = "a unit that drivegain did not write"
         expected = "one of an earlier `schedule`"
-    elif option not in text:
+    elif path.suffix == ".service" and not is_service_of(text, cell_file):
         found = "the unit of another cell file"
-        expected = f"one with {option}"
+        expected = f"one of {cell_file}"
     if found:
         remedy = (
             "name another folder with --to, or move it away; remove it if the cell file has moved"

@@ -146,13 +146,20 @@ def next_commands(wanted: Installation, timer: Unit, folder: Path) -> tuple[str,
     )
 
 
-def cell_option(wanted: Installation) -> str:
-    """Option by which a service of ours is recognised as one of this cell."""
-    return f"--cell {_quoted(str(wanted.cell_file))}"
+def is_service_of(text: str, cell_file: Path) -> bool:
+    """Return whether a service of ours runs the job of this cell file.
+
+    Earlier versions wrote `--cell` before the file.
+    """
+    argument = " " + _quoted(str(cell_file))
+    for line in text.splitlines():
+        if line.startswith("ExecStart=") and line.endswith(argument):
+            return True
+    return False
 
 
 def _command(wanted: Installation) -> tuple[str, ...]:
-    return (str(wanted.program), "recalibrate", "--cell", str(wanted.cell_file))
+    return (str(wanted.program), "recalibrate", str(wanted.cell_file))
 
 
 def _service(cell: Cell, section: Recalibration, wanted: Installation) -> str:

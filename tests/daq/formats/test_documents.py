@@ -962,8 +962,9 @@ def test_an_integer_of_a_dcf_that_its_type_does_not_hold_is_refused(number: str)
 
 
 def test_a_limit_of_a_dcf_does_not_make_an_object_unsigned() -> None:
-    [scalar] = _integer_document("0xFFFFFFFF", "LowLimit=0\n").locate(("2003",))
-    assert scalar.value == -1.0
+    for limits in ("LowLimit=0\n", "LowLimit=0x80000000\nHighLimit=0x7FFFFFFF\n"):
+        [scalar] = _integer_document("0xFFFFFFFF", limits).locate(("2003",))
+        assert scalar.value == -1.0
 
 
 def test_a_long_line_of_blanks_in_a_dcf_does_not_hold_up_its_reader() -> None:

@@ -172,6 +172,8 @@ def test_a_unit_of_an_earlier_version_is_replaced(
     now = service.read_text(encoding="utf-8")
     assert now.startswith("# Made by `drivegain schedule`, which may replace this file.\n")
     changed_now = now.replace("`drivegain schedule`", "`drivegain install-units`", 1)
+    assert changed_now.count(" recalibrate ") == 1
+    changed_now = changed_now.replace(" recalibrate ", " recalibrate --cell ")
     service.write_text(changed_now, encoding="utf-8")
     assert main(command) == ExitCode.OK
     assert service.read_text(encoding="utf-8") == now
@@ -181,7 +183,7 @@ def test_cron_gets_a_line(rig: Rig, capsys: pytest.CaptureFixture[str]) -> None:
     assert run_verb("schedule", "--cell", rig.cell_file, "--cron") == ExitCode.OK
     line = capsys.readouterr().out
     assert line.startswith("0 0 * * 1  ")
-    assert line.rstrip().endswith(f"recalibrate --cell '{rig.cell_file}'")
+    assert line.rstrip().endswith(f"recalibrate '{rig.cell_file}'")
     assert line.count("\n") == 1
     code = run_verb("schedule", "--cell", rig.cell_file, "--cron", "--schedule", "Sun 03:00")
     assert code == ExitCode.USAGE
@@ -221,12 +223,25 @@ def test_names_and_paths_cannot_say_more_than_they_are(rig: Rig) -> None:
     assert len(others) == 4
     text = units_of(named, section, wanted)[0].text
     service = read(text)["Service"]
-    assert service["ExecStart"] == (
-        '/usr/bin/true recalibrate --cell "/cells/100 %% $$HOME/it\'s.yaml"'
-    )
+    expected = '/usr/bin/true recalibrate "/cells/100 %% $$HOME/it\'s.yaml"'
+    assert service["ExecStart"] == expected
     first_unit = units_of(named, section, wanted)[0]
     assert first_unit.text.count("\nExecStart=") == 1
-    assert cron_line(wanted).endswith("--cell '/cells/100 \\% $HOME/it'\"'\"'s.yaml'")
+    assert cron_line(wanted).endswith("recalibrate '/cells/100 \\% $HOME/it'\"'\"'s.yaml'")
+
+
+def test_the_command_of_a_unit_has_options_of_the_help_alone(
+    rig: Rig, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run_verb("recalibrate", "--help") == ExitCode.OK
+    shown = capsys.readouterr().out
+    section = rig.cell.recalibration
+    assert section is not None
+    service = read(units_of(rig.cell, section, installation(rig))[0].text)["Service"]
+    for command in (service["ExecStart"], cron_line(installation(rig))):
+        assert " recalibrate " in command
+        for option in re.findall(r" (--?[a-z-]+)", command):
+            assert option in shown
 
 
 def test_the_unit_of_another_cell_and_a_pipe_are_left_alone(
