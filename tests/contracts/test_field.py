@@ -41,7 +41,9 @@ def _tests_of(file: str) -> frozenset[str]:
         if isinstance(node, ast.FunctionDef):
             names.add(node.name)
         if isinstance(node, ast.ClassDef):
-            names |= {f"{node.name}::{one.name}" for one in node.body if hasattr(one, "name")}
+            for method in node.body:
+                if isinstance(method, ast.FunctionDef):
+                    names.add(f"{node.name}::{method.name}")
     return frozenset(names)
 
 
