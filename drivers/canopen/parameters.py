@@ -266,19 +266,26 @@ def _undo(
     """
     restored = []
     problems = []
+    # What a bus says concerns every drive on it: each reason once, with the axes that have it.
+    axes_by_reason: dict[str, list[str]] = {}
     try:
         # One time limit for all drives that do not answer.
         network.find_silent([value.axis for value in tried])
     except DriverError as problem:
-        problems.append(str(problem))
+        axes_by_reason[str(problem)] = []
     for value in tried:
         try:
             _put_back(network, value, save=value.axis in saved)
             restored.append(value.axis.name)
+        except NodeError as problem:
+            problems.append(str(problem))
         except DriverError as problem:
-            problems.append(
-                str(problem) if isinstance(problem, NodeError) else f"{value.axis.name}: {problem}"
-            )
+            axes_by_reason.setdefault(str(problem), []).append(value.axis.name)
+    for reason, axes in axes_by_reason.items():
+        if axes:
+            problems.append(f"{', '.join(axes)}: {reason}")
+        else:
+            problems.append(reason)
     if problems and tried:
         raise ParametersMixed(tuple(restored), tuple(problems)) from error
     if restored:

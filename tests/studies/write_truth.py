@@ -83,13 +83,20 @@ def _written_with_backup(found: re.Match[str], facts: Facts) -> bool:
 
 
 def _subject_not_begun(found: re.Match[str], facts: Facts) -> bool:
-    """Hold where a change of a file, or of any file of a folder, was begun and not made;
-    the controller's file changes once, and is compared.
+    """Hold where a change of a file, or of any file of a folder, was begun and not made, or its
+    folder was not; the controller's file changes once, and is compared.
     """
     subject = Path(found["subject"])
     if subject == facts.controller and subject in facts.before:
         return facts.is_as_before(subject)
+    if facts.not_made.intersection(subject.parents):
+        return facts.is_as_before(subject)
     return any(path.is_relative_to(subject) for path in facts.not_made)
+
+
+def _is_mixed_or_bus_failed(found: re.Match[str], facts: Facts) -> bool:
+    """Hold where drives have gains of both; behind a bus that has failed, nobody knows."""
+    return facts.content is Content.MIXED or ": bus " in found["why"]
 
 
 def _note_not_made(found: re.Match[str], facts: Facts) -> bool:
@@ -127,11 +134,14 @@ RULES = (
     Rule(r"the history lacks this write", lambda _, facts: not facts.has_write),
     Rule(r"the history may lack this write", _is_any),
     Rule(r"the audit log may lack the entry that it is (applied|rolled back)", _is_new),
+    # Where the bus has failed, nobody knows what the drives have.
+    Rule(r"the audit log may lack the entry that it is failed(?=.* NOT confirmed where)", _is_any),
     Rule(r"the audit log may lack the entry that it is failed", _is_not_new),
     Rule(r"the audit log may lack the entry that it is refused", _is_old),
     Rule(
-        r"the previous values are restored in no drive, and NOT confirmed where",
-        lambda _, facts: facts.content is Content.MIXED,
+        r"the previous values are restored in no drive, and NOT confirmed where (?P<why>.*?); do "
+        "not enable an axis",
+        _is_mixed_or_bus_failed,
     ),
     Rule(r"Written to \S+, backup (?P<backup>\S+); audit log", _written_with_backup),
     Rule(
@@ -190,8 +200,14 @@ def false_sentences(said: str, facts: Facts) -> tuple[str, ...]:
     return tuple(found)
 
 
-#: Words by which a command that fails says that the new gains are there; the second are a job's
-WRITTEN = ("has the new content", "written to the controller's file: file")
+WRITTEN = (
+    "has the new content",
+    "written to the controller's file: file",
+    "restored in no drive, and NOT confirmed where",
+)
+"""Words by which a command that fails says that the new gains are there: of a file, of a job, and
+of drives behind a bus that has failed, which may have them.
+"""
 
 
 def wrong_code(code: int | None, said: str, facts: Facts) -> str:

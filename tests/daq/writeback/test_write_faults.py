@@ -295,6 +295,30 @@ def test_a_backup_that_is_named_must_have_the_old_content() -> None:
     assert false_sentences(said, facts) != ()
 
 
+def test_of_drives_behind_a_bus_that_has_failed_nothing_is_known() -> None:
+    why = "J1, J2: bus socketcan:can0: the wire was cut"
+    said = (
+        "the audit log may lack the entry that it is failed: a.jsonl: no space error: the write "
+        "failed midway; the previous values are restored in no drive, and NOT confirmed where "
+        f"{why}; do not enable an axis before every drive has its previous value again"
+    )
+    for content in (Content.OLD, Content.NEW, Content.MIXED):
+        assert false_sentences(said, _facts(content)) == ()
+        assert wrong_code(5, said, _facts(content)) == ""
+    # A drive that answers says which gains it has.
+    said = said.replace(why, "J4 reads 0")
+    assert false_sentences(said, _facts(Content.MIXED)) == ()
+    assert len(false_sentences(said, _facts(Content.OLD))) == 1
+
+
+def test_a_file_in_a_folder_that_was_not_made_is_as_it_was() -> None:
+    folder = Path("/cell/session")
+    said = f"{folder}/c.yaml: found no space; expected room; it is as it was"
+    facts = _facts(Content.OLD)
+    assert len(false_sentences(said, facts)) == 1
+    assert false_sentences(said, replace(facts, not_made=frozenset((folder,)))) == ()
+
+
 def test_a_note_that_is_said_to_be_lacking_was_not_made() -> None:
     note = Path("/cell/a.jsonl.head")
     said = (

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 
 import can
@@ -19,7 +20,7 @@ from drivers.canopen.parameters import (
     recording_leftover,
     write_parameters,
 )
-from drivers.errors import ObjectAccessError, ParameterRefused, ParametersMixed
+from drivers.errors import BusError, ObjectAccessError, ParameterRefused, ParametersMixed
 from drivers.profiles.profile import (
     DriveParameter,
     Identity,
@@ -160,6 +161,25 @@ def test_one_axis_with_power_forbids_every_write_although_it_is_not_written() ->
     assert str(refusal.value).startswith(expected)
     assert refusal.value.node_id == 3
     assert downloads(bus) == 0
+
+
+def test_a_bus_that_fails_for_good_is_named_once_with_all_drives_behind_it() -> None:
+    network, bus = drives()
+    third = bus.nodes[2]
+
+    def cut_the_wire(sent: can.Message) -> list[can.Message]:
+        bus.broken = third.value(0x2003, 1) == NEW
+        return [sent]
+
+    bus.tamper = cut_the_wire
+    with suppress(BusError), network:
+        writes = writes_of(network, NEW, NEW, NEW)
+        with pytest.raises(ParametersMixed) as failure:
+            write_parameters(network, writes, Saving.KNOWN, _ignore)
+    assert failure.value.restored == ()
+    (problem,) = failure.value.problems
+    assert problem.startswith("J1, J2, J3: bus ")
+    assert problem.endswith("the wire was cut")
 
 
 def test_power_that_comes_with_the_second_write_puts_the_first_back() -> None:
