@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose
 
 from drivers.errors import MotionRefused
 from drivers.move import (
@@ -21,115 +23,146 @@ from drivers.move import (
 )
 
 AXES = 3
-distances = st.tuples(
-    *[st.floats(-1e3, 1e3).filter(lambda d: d == 0 or abs(d) > 1e-3)] * AXES
-).filter(any)
-limits = st.tuples(*[st.floats(1e-2, 1e3)] * AXES)
+NAMES = ("a", "b", "c")
+Values = tuple[float, ...]
+Counts = tuple[int, ...]
 
 
-def made(
-    distance: Sequence[float], velocity: Sequence[float], acceleration: Sequence[float]
+def on_each_axis(values: st.SearchStrategy[Any]) -> st.SearchStrategy[tuple[Any, ...]]:
+    return st.tuples(*[values] * AXES)
+
+
+def is_zero_or_not_tiny(distance: float) -> bool:
+    return distance == 0 or abs(distance) > 1e-3
+
+
+distances = on_each_axis(st.floats(-1e3, 1e3).filter(is_zero_or_not_tiny)).filter(any)
+limits = on_each_axis(st.floats(1e-2, 1e3))
+
+
+def trapezoid_from_zero(
+    distance: Sequence[float], velocity_limit: Sequence[float], acceleration_limit: Sequence[float]
 ) -> Trapezoid:
     return synchronised(
-        np.zeros(AXES), np.array(distance), np.array(velocity), np.array(acceleration)
+        np.zeros(AXES),
+        np.array(distance),
+        np.array(velocity_limit),
+        np.array(acceleration_limit),
     )
 
 
 @given(distances, limits, limits)
 def test_limits_are_kept_and_one_is_used(
-    distance: tuple[float, ...], velocity: tuple[float, ...], acceleration: tuple[float, ...]
+    distance: Values, velocity_limit: Values, acceleration_limit: Values
 ) -> None:
-    path = made(distance, velocity, acceleration)
-    speed_share = np.abs(path.velocity) / np.array(velocity)
-    ramp_share = np.abs(path.acceleration) / np.array(acceleration)
+    path = trapezoid_from_zero(distance, velocity_limit, acceleration_limit)
+    speed_share = np.abs(path.velocity) / np.array(velocity_limit)
+    ramp_share = np.abs(path.acceleration) / np.array(acceleration_limit)
     assert np.all(speed_share <= 1 + 1e-9)
     assert np.all(ramp_share <= 1 + 1e-9)
     assert np.max(ramp_share) == pytest.approx(1.0)
-    if path.duration_s > 2 * path.ramp_s * (1 + 1e-9):
+    has_cruise = path.duration_s > 2 * path.ramp_s * (1 + 1e-9)
+    if has_cruise:
         assert np.max(speed_share) == pytest.approx(1.0)
 
 
 @pytest.mark.slow
 @given(distances, limits, limits)
 def test_all_axes_run_from_start_to_end_together(
-    distance: tuple[float, ...], velocity: tuple[float, ...], acceleration: tuple[float, ...]
+    distance: Values, velocity_limit: Values, acceleration_limit: Values
 ) -> None:
-    path = made(distance, velocity, acceleration)
+    path = trapezoid_from_zero(distance, velocity_limit, acceleration_limit)
     time_s = np.linspace(0.0, path.duration_s, 4001)
-    position, speed, _ = path.at(time_s)
-    np.testing.assert_allclose(position[0], 0.0, atol=1e-9)
-    actual = position[-1]
-    np.testing.assert_allclose(actual, distance, rtol=1e-9)
+    position, velocity, _ = path.at(time_s)
+    assert_allclose(position[0], 0.0, atol=1e-9)
+    assert_allclose(position[-1], distance, rtol=1e-9)
     # The path parameter is the same for all axes, so a coupled motor moves on a trapezoid too.
-    share = position[:, np.array(distance) != 0] / np.array(distance)[np.array(distance) != 0]
-    expected = np.repeat(share[:, :1], share.shape[1], axis=1)
-    np.testing.assert_allclose(share, expected, atol=1e-9)
-    travelled = np.sum(0.5 * (speed[1:] + speed[:-1]) * np.diff(time_s)[:, None], axis=0)
-    np.testing.assert_allclose(travelled, distance, rtol=1e-3, atol=1e-6)
+    way = np.array(distance)
+    moves = way != 0
+    path_parameter = position[:, moves] / way[moves]
+    of_first_axis = path_parameter[:, :1]
+    expected = np.repeat(of_first_axis, path_parameter.shape[1], axis=1)
+    assert_allclose(path_parameter, expected, atol=1e-9)
+    travelled = np.trapezoid(velocity, time_s, axis=0)
+    assert_allclose(travelled, distance, rtol=1e-3, atol=1e-6)
 
 
 def test_no_distance_takes_no_time() -> None:
-    duration_s = made((0.0,) * AXES, (1.0,) * AXES, (1.0,) * AXES).duration_s
-    assert duration_s == 0.0
+    ones = (1.0,) * AXES
+    path = trapezoid_from_zero((0.0,) * AXES, ones, ones)
+    assert path.duration_s == 0.0
 
 
 def test_a_limit_must_be_positive() -> None:
+    ones = (1.0,) * AXES
     with pytest.raises(ValueError, match="positive"):
-        made((1.0,) * AXES, (1.0, 0.0, 1.0), (1.0,) * AXES)
+        trapezoid_from_zero(ones, (1.0, 0.0, 1.0), ones)
 
 
-counts = st.tuples(*[st.integers(-2_000_000, 2_000_000)] * AXES)
-ROOM = (AxisLimits(-3_000_000, 3_000_000, 900_000.0, 4_000_000.0),) * AXES
+counts = on_each_axis(st.integers(-2_000_000, 2_000_000))
+WIDE_LIMITS = (AxisLimits(-3_000_000, 3_000_000, 900_000.0, 4_000_000.0),) * AXES
+FEW_COUNTS = 2000
+"""Up to here no whole speed need be near enough for a common end time."""
+TWO_SYNC_PERIODS_S = 2e-3
 
 
 @given(counts, counts)
-def test_whole_numbers_keep_limits_and_end_times(
-    start: tuple[int, ...], target: tuple[int, ...]
-) -> None:
-    move = synchronised_move(start, target, ROOM)
-    check_moves(start, (move,), MotionPermission("test", ROOM), ("a", "b", "c"))
-    going = [
-        (seconds, abs(b - a))
-        for seconds, a, b in zip(move.duration_s(start), start, target, strict=True)
-        if abs(b - a) > 2000
-    ]
-    # For a few counts no whole speed is near enough, so their time is left out.
-    longest = max((seconds for seconds, _ in going), default=0.0)
-    for seconds, _ in going:
-        assert abs(seconds - longest) < 2e-3  # two periods of a 1 kHz SYNC
+def test_whole_numbers_keep_limits_and_end_times(start: Counts, target: Counts) -> None:
+    move = synchronised_move(start, target, WIDE_LIMITS)
+    permission = MotionPermission("test", WIDE_LIMITS)
+    check_moves(start, (move,), permission, NAMES)
+    way = np.abs(np.subtract(target, start))
+    durations_s = np.array(move.duration_s(start))[way > FEW_COUNTS]
+    longest_s = np.max(durations_s, initial=0.0)
+    assert np.all(longest_s - durations_s < TWO_SYNC_PERIODS_S)
 
 
-@given(
-    st.tuples(*[st.integers(-500, 500)] * AXES),
-    st.tuples(*[st.floats(3, 500)] * AXES),
-    st.tuples(*[st.floats(3, 500)] * AXES),
-)
+tight_limits = on_each_axis(st.floats(3, 500))
+
+
+@given(on_each_axis(st.integers(-500, 500)), tight_limits, tight_limits)
 def test_rounding_never_leaves_tight_limits(
-    target: tuple[int, ...], velocity: tuple[float, ...], acceleration: tuple[float, ...]
+    target: Counts, velocity_limit: Values, acceleration_limit: Values
 ) -> None:
-    room = tuple(AxisLimits(-500, 500, v, a) for v, a in zip(velocity, acceleration, strict=True))
-    move = synchronised_move((0,) * AXES, target, room)
-    start_counts = (0,) * AXES
-    check_moves(start_counts, (move,), MotionPermission("test", room), ("a", "b", "c"))
+    axis_limits = tuple(
+        AxisLimits(-500, 500, velocity, acceleration)
+        for velocity, acceleration in zip(velocity_limit, acceleration_limit, strict=True)
+    )
+    start = (0,) * AXES
+    move = synchronised_move(start, target, axis_limits)
+    permission = MotionPermission("test", axis_limits)
+    check_moves(start, (move,), permission, NAMES)
 
 
-def test_refusals_name_axis_found_and_allowed() -> None:
-    room = (AxisLimits(-10, 10, 100.0, 1000.0),)
-    granted = MotionPermission("test", room)
-    for start, move, words in (
+ONE = (AxisLimits(-10, 10, 100.0, 1000.0),)
+ONE_GRANTED = MotionPermission("test", ONE)
+
+
+@pytest.mark.parametrize(
+    ("start", "move", "words"),
+    [
         (0, Move((11,), (50,), (500,)), ("J1", "11", "-10 to 10")),
         (0, Move((5,), (101,), (500,)), ("J1", "velocity 101", "100")),
         (0, Move((5,), (50,), (1001,)), ("J1", "acceleration 1001", "1000")),
         (0, Move((5,), (0,), (500,)), ("J1", "velocity 0")),
         (-11, Move((5,), (50,), (500,)), ("J1", "starts at -11", "-10 to 10")),
         (0, Move((5, 6), (50, 50), (500, 500)), ("1 axes",)),
-    ):
-        with pytest.raises(MotionRefused) as refusal:
-            check_moves((start,), (move,), granted, ("J1",))
-        for word in words:
-            assert word in str(refusal.value)
+    ],
+    ids=["target", "velocity", "acceleration", "no velocity", "start", "axes"],
+)
+def test_refusals_name_axis_found_and_allowed(
+    start: int, move: Move, words: tuple[str, ...]
+) -> None:
+    with pytest.raises(MotionRefused) as refusal:
+        check_moves((start,), (move,), ONE_GRANTED, ("J1",))
+    for word in words:
+        assert word in str(refusal.value)
+
+
+def test_a_permission_without_an_operator_is_refused() -> None:
+    nameless = MotionPermission(" ", ONE)
     with pytest.raises(MotionRefused, match="names no operator"):
-        check_moves((0,), (), MotionPermission(" ", room), ("J1",))
+        check_moves((0,), (), nameless, ("J1",))
 
 
 # One axis from 10 to 34 units, at most 4 unit/s and 2 unit/s²: 2 s of ramp, 4 s of cruise, 2 s of
@@ -160,10 +193,8 @@ def test_a_long_way_has_ramps_and_a_cruise_as_by_hand() -> None:
 def test_a_way_at_a_time_is_where_the_formulas_of_a_ramp_put_it(
     time_s: float, position: float, velocity: float, acceleration: float
 ) -> None:
-    found = LONG_WAY.at(np.array([time_s]))
-    assert [float(value[0, 0]) for value in found] == pytest.approx(
-        [position, velocity, acceleration], abs=1e-9
-    )
+    found = np.ravel(LONG_WAY.at(np.array([time_s])))
+    assert found == pytest.approx([position, velocity, acceleration], abs=1e-9)
 
 
 def test_a_way_accelerates_from_its_first_instant() -> None:
@@ -174,9 +205,7 @@ def test_a_way_accelerates_from_its_first_instant() -> None:
 
 def test_a_short_way_has_no_cruise() -> None:
     # 2 units at 2 unit/s²: 1 s up to 2 unit/s, below the limit of 4, and 1 s down.
-    velocity_limit = np.array([4.0])
-    acceleration_limit = np.array([2.0])
-    short = synchronised(np.array([0.0]), np.array([-2.0]), velocity_limit, acceleration_limit)
+    short = synchronised(np.array([0.0]), np.array([-2.0]), np.array([4.0]), np.array([2.0]))
     assert short.duration_s == pytest.approx(2.0)
     assert short.ramp_s == pytest.approx(1.0)
     assert short.velocity == pytest.approx([-2.0])
@@ -189,25 +218,27 @@ def test_a_way_without_distance_has_no_speed_and_no_acceleration() -> None:
 
 
 def test_one_limit_of_zero_among_others_is_refused_with_all_of_them() -> None:
-    with pytest.raises(
-        ValueError, match=r"positive, found \(1.0, 1.0, 1.0\) and \(2.0, 0.0, 2.0\)"
-    ):
+    words = r"positive, found \(1.0, 1.0, 1.0\) and \(2.0, 0.0, 2.0\)"
+    with pytest.raises(ValueError, match=words):
         synchronised(np.zeros(3), np.ones(3), (1.0, 1.0, 1.0), (2.0, 0.0, 2.0))  # type: ignore[arg-type]
 
 
 def test_an_axis_that_stays_needs_no_time_and_gets_the_least_profile() -> None:
-    move = synchronised_move((7, 0), (7, 4000), (AxisLimits(-9999, 9999, 1001.0, 2001.0),) * 2)
+    start = (7, 0)
+    target = (7, 4000)
+    axis_limits = AxisLimits(-9999, 9999, 1001.0, 2001.0)
+    move = synchronised_move(start, target, (axis_limits, axis_limits))
     assert move.velocity_counts_s == (1, 1000)
     assert move.acceleration_counts_s2 == (1, 2000)
     # 0.5 s up to 1000 counts/s over 250 counts, 3.5 s of cruise, 0.5 s down.
-    assert list(move.duration_s((7, 0))) == pytest.approx([0.0, 4.5])
+    assert list(move.duration_s(start)) == pytest.approx([0.0, 4.5])
     assert move.dwell_cycles == 0
 
 
 def test_a_move_keeps_the_cycles_that_it_dwells() -> None:
-    room = (AxisLimits(-10, 10, 100.0, 100.0),)
-    dwell_cycles = synchronised_move((0,), (5,), room, 12).dwell_cycles
-    assert dwell_cycles == 12
+    axis_limits = AxisLimits(-10, 10, 100.0, 100.0)
+    move = synchronised_move((0,), (5,), (axis_limits,), 12)
+    assert move.dwell_cycles == 12
 
 
 TWO = (AxisLimits(-10, 10, 100.0, 1000.0), AxisLimits(-20, 20, 50.0, 500.0))
@@ -226,16 +257,17 @@ def test_an_axis_behind_one_that_stays_is_checked() -> None:
 
 
 def test_limits_themselves_are_allowed() -> None:
-    moves = (Move((10, -20), (100, 50), (1000, 500)),)
-    check_moves((-10, 20), moves, TWO_GRANTED, ("J1", "J2"))
+    move = Move((10, -20), (100, 50), (1000, 500))
+    check_moves((-10, 20), (move,), TWO_GRANTED, ("J1", "J2"))
 
 
 def test_a_later_move_starts_where_the_one_before_ends() -> None:
     there = Move((5, 0), (100, 0), (1000, 0))
     # J1 stays at 5 in the second move, so its profile of zeros is none.
-    moves = (there, Move((5, 1), (0, 50), (0, 500)))
-    check_moves((0, 0), moves, TWO_GRANTED, ("J1", "J2"))
-    text = _refusal((0, 0), there, Move((0, 1), (0, 50), (0, 500)))
+    second = Move((5, 1), (0, 50), (0, 500))
+    check_moves((0, 0), (there, second), TWO_GRANTED, ("J1", "J2"))
+    back = Move((0, 1), (0, 50), (0, 500))
+    text = _refusal((0, 0), there, back)
     assert text == "move 1: J1: velocity 0, allowed is above 0 up to 100"
 
 
@@ -245,10 +277,11 @@ def test_a_move_of_too_many_values_in_one_profile_is_refused_with_its_lengths() 
 
 
 def test_a_dwell_before_the_target_is_refused_and_none_is_not() -> None:
-    text = _refusal((0, 0), Move((5, 5), (50, 50), (500, 500), dwell_cycles=-1))
+    before_target = Move((5, 5), (50, 50), (500, 500), dwell_cycles=-1)
+    text = _refusal((0, 0), before_target)
     assert text == "move 0: dwells for -1 cycles"
-    moves = (Move((5, 5), (50, 50), (500, 500), 0),)
-    check_moves((0, 0), moves, TWO_GRANTED, ("J1", "J2"))
+    without_dwell = Move((5, 5), (50, 50), (500, 500), dwell_cycles=0)
+    check_moves((0, 0), (without_dwell,), TWO_GRANTED, ("J1", "J2"))
 
 
 def test_a_permission_for_fewer_axes_than_the_cell_is_refused_with_both_numbers() -> None:

@@ -77,21 +77,36 @@ class _Urdf:
         mass = 0.4 + 0.17 * self.count
         along = 0.03 + 0.01 * (self.count % 5)
         self.parts.append(
-            f'<joint name="{name}" type="{kind}"><origin xyz="{xyz}" rpy="{rpy}"/><parent '
-            f'link="{parent}"/><child link="{name}"/><axis xyz="{axis}"/><limit lower="-3" '
-            f'upper="3" velocity="3" effort="99"/></joint><link name="{name}"><inertial><origin '
-            f'xyz="{along} 0.01 -0.02"/><mass value="{mass}"/><inertia ixx="0.004" ixy="0.0003" '
-            'ixz="-0.0002" iyy="0.006" iyz="0.0004" izz="0.005"/></inertial></link>'
+            f'''
+            <joint name="{name}" type="{kind}">
+              <origin xyz="{xyz}" rpy="{rpy}"/>
+              <parent link="{parent}"/>
+              <child link="{name}"/>
+              <axis xyz="{axis}"/>
+              <limit lower="-3" upper="3" velocity="3" effort="99"/>
+            </joint>
+            <link name="{name}">
+              <inertial>
+                <origin xyz="{along} 0.01 -0.02"/>
+                <mass value="{mass}"/>
+                <inertia ixx="0.004" ixy="0.0003" ixz="-0.0002"
+                         iyy="0.006" iyz="0.0004" izz="0.005"/>
+              </inertial>
+            </link>'''
         )
         return name
 
-    def frame(self, name: str, parent: str, xyz: str) -> str:
-        """Add a link without mass, fixed to another; its name."""
+    def frame(self, name: str, parent: str, xyz: str = "0 0 0", rpy: str = "0 0 0") -> None:
+        """Add a link without mass, fixed to another."""
         self.parts.append(
-            f'<joint name="to-{name}" type="fixed"><origin xyz="{xyz}"/><parent link="{parent}"/>'
-            f'<child link="{name}"/></joint><link name="{name}"/>'
+            f'''
+            <joint name="to-{name}" type="fixed">
+              <origin xyz="{xyz}" rpy="{rpy}"/>
+              <parent link="{parent}"/>
+              <child link="{name}"/>
+            </joint>
+            <link name="{name}"/>'''
         )
-        return name
 
     @property
     def text(self) -> str:
@@ -105,26 +120,22 @@ BASE_M = 0.25
 
 def _five_bar() -> Mechanism:
     urdf = _Urdf("five-bar")
-    for side, at in (("left", -0.5 * BASE_M), ("right", 0.5 * BASE_M)):
-        xyz = f"{at} 0 0"
-        crank = urdf.joint(f"{side}-crank", "revolute", "base", xyz, "0 0 1")
+    for side, x_m in (("left", -0.5 * BASE_M), ("right", 0.5 * BASE_M)):
+        crank = urdf.joint(f"{side}-crank", "revolute", "base", f"{x_m} 0 0", "0 0 1")
         rod = urdf.joint(f"{side}-rod", "revolute", crank, f"{CRANK_M} 0 0", "0 0 1")
         urdf.frame(f"{side}-tip", rod, f"{ROD_M} 0 0")
-    assembly = {"left-crank": 2.1, "left-rod": -1.28, "right-crank": 1.05, "right-rod": 1.28}
-    link_pair = LinkPair("tip", "left-tip", "right-tip", ("x", "y"))
-    closures = (link_pair,)
-    gains = np.array([20.0, -15.0])
-    gravity_m_s2 = (0.0, -9.81, 0.0)
+    tips = LinkPair("tip", "left-tip", "right-tip", ("x", "y"))
+    assembly_rad = {"left-crank": 2.1, "left-rod": -1.28, "right-crank": 1.05, "right-rod": 1.28}
     return Mechanism(
         name="five-bar",
         urdf=urdf.text,
         motors=("left-crank", "right-crank"),
-        closures=closures,
+        closures=(tips,),
         platform="left-rod",
         mobility=2,
-        gains=gains,
-        assembly_rad=assembly,
-        gravity_m_s2=gravity_m_s2,
+        gains=np.array([20.0, -15.0]),
+        assembly_rad=assembly_rad,
+        gravity_m_s2=(0.0, -9.81, 0.0),
     )
 
 
@@ -138,39 +149,46 @@ def leg_angles(pose: FloatArray, leg: int) -> tuple[FloatArray, FloatArray]:
     """Both joint angles of a leg of the planar platform, each (k,), at poses (x, y, angle),
     shape (k, 3).
     """
-    x, y, side = LEGS[leg]
+    base_x, base_y, side = LEGS[leg]
+    x, y, angle = pose.T
     end = -HALF_M if leg < 2 else HALF_M
-    pose_cosine = np.cos(pose[:, 2])
-    dx = pose[:, 0] + end * pose_cosine - x
-    pose_sine = np.sin(pose[:, 2])
-    dy = pose[:, 1] + end * pose_sine - y
-    apart = np.hypot(dx, dy)
-    first = np.arctan2(dy, dx) + side * np.arccos(0.5 * apart / LEG_M)
-    elbow = np.arctan2(dy - LEG_M * np.sin(first), dx - LEG_M * np.cos(first)) - first
-    return np.unwrap(first), (elbow + np.pi) % (2.0 * np.pi) - np.pi
+    # From the base of the leg to its end at the platform.
+    dx = x + end * np.cos(angle) - base_x
+    dy = y + end * np.sin(angle) - base_y
+    distance = np.hypot(dx, dy)
+    crank = np.arctan2(dy, dx) + side * np.arccos(0.5 * distance / LEG_M)
+    rod = np.arctan2(dy - LEG_M * np.sin(crank), dx - LEG_M * np.cos(crank))
+    elbow = rod - crank
+    return np.unwrap(crank), _within_half_turn(elbow)
+
+
+def _within_half_turn(angle: FloatArray) -> FloatArray:
+    return (angle + np.pi) % (2.0 * np.pi) - np.pi
 
 
 def _planar() -> Mechanism:
     urdf = _Urdf("planar")
     home = np.zeros((1, 3))
-    assembly: dict[str, float] = {}
-    for leg, (x, y, _) in enumerate(LEGS):
-        xyz = f"{x} {y} 0"
-        crank = urdf.joint(f"motor-{leg}", "revolute", "base", xyz, "0 0 1")
-        rod = urdf.joint(f"elbow-{leg}", "revolute", crank, f"{LEG_M} 0 0", "0 0 1")
-        first, elbow = (float(angle[0]) for angle in leg_angles(home, leg))
-        assembly |= {crank: first, rod: elbow}
+    assembly_rad: dict[str, float] = {}
+    for leg, (x_m, y_m, _) in enumerate(LEGS):
+        crank = urdf.joint(f"motor-{leg}", "revolute", "base", f"{x_m} {y_m} 0", "0 0 1")
+        elbow = urdf.joint(f"elbow-{leg}", "revolute", crank, f"{LEG_M} 0 0", "0 0 1")
+        crank_angles, elbow_angles = leg_angles(home, leg)
+        assembly_rad[crank] = float(crank_angles[0])
+        assembly_rad[elbow] = float(elbow_angles[0])
         if leg == 0:
-            urdf.joint("platform", "revolute", rod, f"{LEG_M} 0 0", "0 0 1")
-            assembly["platform"] = -first - elbow
+            urdf.joint("platform", "revolute", elbow, f"{LEG_M} 0 0", "0 0 1")
+            assembly_rad["platform"] = -assembly_rad[crank] - assembly_rad[elbow]
         else:
-            urdf.frame(f"tip-{leg}", rod, f"{LEG_M} 0 0")
-            urdf.frame(f"corner-{leg}", "platform", f"{0.0 if leg == 1 else 2.0 * HALF_M} 0 0")
+            urdf.frame(f"tip-{leg}", elbow, f"{LEG_M} 0 0")
+    # Leg 0 carries the platform; leg 1 is at the same end of it, legs 2 and 3 at the other.
+    urdf.frame("corner-1", "platform")
+    urdf.frame("corner-2", "platform", f"{2.0 * HALF_M} 0 0")
+    urdf.frame("corner-3", "platform", f"{2.0 * HALF_M} 0 0")
     closures = tuple(
-        LinkPair(f"corner {n}", f"corner-{n}", f"tip-{n}", ("x", "y")) for n in (1, 2, 3)
+        LinkPair(f"corner {leg}", f"corner-{leg}", f"tip-{leg}", ("x", "y")) for leg in (1, 2, 3)
     )
     motors = tuple(f"motor-{leg}" for leg in range(4))
-    gains = np.array([2.0, -1.5, 1.8, 2.2])
     return Mechanism(
         name="planar",
         urdf=urdf.text,
@@ -178,8 +196,8 @@ def _planar() -> Mechanism:
         closures=closures,
         platform="platform",
         mobility=3,
-        gains=gains,
-        assembly_rad=assembly,
+        gains=np.array([2.0, -1.5, 1.8, 2.2]),
+        assembly_rad=assembly_rad,
     )
 
 
@@ -190,23 +208,16 @@ WIDTH_M = 0.08
 def _three_legs() -> Mechanism:
     """A slide along each axis, and a parallelogram from it to a platform that only translates."""
     urdf = _Urdf("three-legs")
-    turns = (
+    # Leg n has the axes x, y, z where leg 0 has them shifted by n.
+    directions = (
         "0 0 0",
         "1.5707963267948966 0 1.5707963267948966",
         "-1.5707963267948966 -1.5707963267948966 0",
     )
-    for leg, rpy in enumerate(turns):
-        shifted_identity = np.roll(np.eye(3), leg, axis=1)
-        axes = shifted_identity[0]
-        xyz = " ".join(map(str, -SLIDE_M * axes))
-        slide = urdf.joint(
-            f"slide-{leg}",
-            "prismatic",
-            "base",
-            xyz,
-            "1 0 0",
-            rpy=rpy,
-        )
+    for leg, rpy in enumerate(directions):
+        xyz = ["0.0", "0.0", "0.0"]
+        xyz[leg] = str(-SLIDE_M)
+        slide = urdf.joint(f"slide-{leg}", "prismatic", "base", " ".join(xyz), "1 0 0", rpy)
         turn = urdf.joint(f"turn-{leg}", "revolute", slide, "0 0 0", "0 1 0")
         bar = urdf.joint(f"bar-{leg}", "revolute", turn, f"0 {0.5 * WIDTH_M} 0", "0 0 1")
         other = urdf.joint(f"other-bar-{leg}", "revolute", turn, f"0 {-0.5 * WIDTH_M} 0", "0 0 1")
@@ -215,31 +226,28 @@ def _three_legs() -> Mechanism:
         urdf.frame(f"bar-end-{leg}", other, f"{SLIDE_M} 0 0")
         hand = urdf.joint(f"hand-{leg}", "revolute", coupler, f"0 {-0.5 * WIDTH_M} 0", "0 1 0")
         urdf.frame(f"centre-{leg}", hand, "0 0 0")
-    rigid = ("x", "y", "z", "rx", "ry", "rz")
     # The frames of the legs are turned against each other: a frame of leg 0 in the directions of
     # leg n.
-    for leg, rpy in ((1, turns[1]), (2, turns[2])):
-        urdf.parts.append(
-            f'<joint name="seat-{leg}" type="fixed"><origin rpy="{rpy}"/><parent link="hand-0"/>'
-            f'<child link="seat-{leg}"/></joint><link name="seat-{leg}"/>'
-        )
-    closures = [
-        LinkPair(f"parallelogram {n}", f"coupler-end-{n}", f"bar-end-{n}", ("x", "y"))
-        for n in range(3)
-    ]
-    closures += [LinkPair(f"platform {n}", f"seat-{n}", f"centre-{n}", rigid) for n in (1, 2)]
-    motors = tuple(f"slide-{leg}" for leg in range(3))
-    gravity_m_s2 = (-4.0, -5.0, -7.4)
-    gains = np.array([150.0, -140.0, 160.0])
+    urdf.frame("seat-1", "hand-0", rpy=directions[1])
+    urdf.frame("seat-2", "hand-0", rpy=directions[2])
+    plane = ("x", "y")
+    rigid = ("x", "y", "z", "rx", "ry", "rz")
+    closures = (
+        LinkPair("parallelogram 0", "coupler-end-0", "bar-end-0", plane),
+        LinkPair("parallelogram 1", "coupler-end-1", "bar-end-1", plane),
+        LinkPair("parallelogram 2", "coupler-end-2", "bar-end-2", plane),
+        LinkPair("platform 1", "seat-1", "centre-1", rigid),
+        LinkPair("platform 2", "seat-2", "centre-2", rigid),
+    )
     return Mechanism(
         name="three-legs",
         urdf=urdf.text,
-        motors=motors,
-        closures=tuple(closures),
+        motors=("slide-0", "slide-1", "slide-2"),
+        closures=closures,
         platform="hand-0",
         mobility=3,
-        gains=gains,
-        gravity_m_s2=gravity_m_s2,
+        gains=np.array([150.0, -140.0, 160.0]),
+        gravity_m_s2=(-4.0, -5.0, -7.4),
     )
 
 

@@ -5,14 +5,14 @@ a log with right checksums may still be made up.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from mcap.opcode import Opcode
 
 from daq.cli.app import main
 from daq.config.cell import Cell
@@ -48,8 +48,23 @@ from tests.daq.log.records import (
 )
 from tests.daq.logs import START_NS, demo_content
 
-CHUNK = 50  #: Samples of a chunk
+SAMPLES = 300
+CHUNK_SAMPLES = 50
+FIRST_CYCLE = 10
 ATTACKER_DIGITS = "1" + 400 * "0"
+LONG_TEXT_BYTES = 30_000_000
+EVENT_CHANNEL = 2  #: in TOPICS
+UNKNOWN_CHANNEL = 9
+UNKNOWN_OPCODE = 0x80
+
+
+def _cycles(count: int = SAMPLES) -> list[int]:
+    return list(range(FIRST_CYCLE, FIRST_CYCLE + count))
+
+
+def _times_ns(count: int = SAMPLES, start_ns: int = START_NS) -> list[int]:
+    """Stamps at 1 kHz."""
+    return [start_ns + k * 1_000_000 for k in range(count)]
 
 
 @dataclass
@@ -57,10 +72,8 @@ class MadeUp:
     """A log of the demo cell at rest, 6 chunks of 50 samples at 1 kHz, for a test to change."""
 
     checkout: Path
-    cycle: list[int] = field(default_factory=lambda: list(range(10, 310)))
-    time_ns: list[int] = field(
-        default_factory=lambda: [START_NS + k * 1_000_000 for k in range(300)]
-    )
+    cycle: list[int] = field(default_factory=_cycles)
+    time_ns: list[int] = field(default_factory=_times_ns)
     extra: list[bytes] = field(default_factory=list)  #: records before the samples
     after: list[bytes] = field(default_factory=list)  #: records behind the samples
     run: dict[str, str] = field(default_factory=dict)  #: entries instead of the genuine ones
@@ -69,7 +82,8 @@ class MadeUp:
 
     def cut(self, first: int, last: int) -> None:
         """Leave out some samples."""
-        del self.cycle[first:last], self.time_ns[first:last]
+        del self.cycle[first:last]
+        del self.time_ns[first:last]
 
     def repeat(self, first: int, last: int) -> None:
         """Write some samples twice."""
@@ -82,27 +96,28 @@ class MadeUp:
 
     def write(self, path: Path) -> Path:
         """The file, with right checksums."""
-        start = demo_content(self.checkout)
-        chunks = [
-            chunk_record(
-                TOPICS + sample_records(self.cycle[k : k + CHUNK], self.time_ns[k : k + CHUNK])
-            )
-            for k in range(0, len(self.cycle), CHUNK)
-        ]
-        missing = (0,) * 6
-        statistics = RunStatistics(300, 0, missing, valid=True)
-        genuine = statistics_record(statistics)
+        content = demo_content(self.checkout)
+        readback = self.readback or readback_bytes(content.readback)
+        run = run_record(content.run) | self.run
+        genuine = RunStatistics(SAMPLES, lost_cycles=0, missing=(0,) * 6, valid=True)
+        statistics = statistics_record(genuine) | self.statistics
         records = [
             HEADER,
-            *(attachment_record(name, data) for name, data in start.files.items()),
-            attachment_record(READBACK, self.readback or readback_bytes(start.readback)),
-            metadata_record(RUN, sealed(run_record(start.run) | self.run)),
+            *(attachment_record(name, data) for name, data in content.files.items()),
+            attachment_record(READBACK, readback),
+            metadata_record(RUN, sealed(run)),
             *self.extra,
-            *chunks,
-            metadata_record(STATISTICS, sealed(genuine | self.statistics)),
+            *self._chunks(),
+            metadata_record(STATISTICS, sealed(statistics)),
             *self.after,
         ]
         return finished_file(path, records)
+
+    def _chunks(self) -> Iterator[bytes]:
+        for first in range(0, len(self.cycle), CHUNK_SAMPLES):
+            last = first + CHUNK_SAMPLES
+            samples = sample_records(self.cycle[first:last], self.time_ns[first:last])
+            yield chunk_record(TOPICS + samples)
 
 
 @pytest.fixture
@@ -124,8 +139,9 @@ READERS: dict[str, Callable[[Path, Path], object]] = {
 def test_the_log_that_the_others_are_made_of_is_sound(
     reader: str, made: MadeUp, tmp_path: Path
 ) -> None:
-    READERS[reader](made.write(tmp_path / "a.mcap"), tmp_path)
-    assert info_report(tmp_path / "a.mcap").valid
+    log = made.write(tmp_path / "a.mcap")
+    READERS[reader](log, tmp_path)
+    assert info_report(log).valid
 
 
 @pytest.mark.parametrize("start_ns", [0, START_NS])
@@ -133,19 +149,19 @@ def test_a_log_of_several_blocks_lasts_from_its_first_stamp_on(
     start_ns: int, checkout: Path, tmp_path: Path
 ) -> None:
     count = 2 * BLOCK_SAMPLES
-    time_ns = [start_ns + k * 1_000_000 for k in range(count)]
-    cycle = list(range(count))
-    log = MadeUp(checkout, cycle, time_ns)
-    log.counted()
-    path = log.write(tmp_path / "a.mcap")
-    described = info_report(path)
+    made = MadeUp(checkout, list(range(count)), _times_ns(count, start_ns))
+    made.counted()
+    log = made.write(tmp_path / "a.mcap")
+    described = info_report(log)
     assert described.samples == count
     assert described.stamped_duration_s == pytest.approx((count - 1) * 1e-3)
 
 
-def _renumbered(made: MadeUp) -> None:
-    made.cut(100, 200)
-    made.cycle = list(range(10, 10 + len(made.cycle)))
+Change = Callable[[MadeUp], None]
+
+
+def _cut_out(made: MadeUp) -> None:
+    made.cut(50, 250)
 
 
 def _cut_and_counted(made: MadeUp) -> None:
@@ -153,38 +169,56 @@ def _cut_and_counted(made: MadeUp) -> None:
     made.counted()
 
 
-def _second(record: bytes, *, behind: bool = False) -> Callable[[MadeUp], None]:
-    return lambda made: (made.after if behind else made.extra).append(record)
+def _without_samples(made: MadeUp) -> None:
+    made.cut(0, SAMPLES)
 
 
-CONTRADICTIONS: dict[str, tuple[Callable[[MadeUp], None], str]] = {
-    "chunks cut out": (
-        lambda made: made.cut(50, 250),
-        "100 samples; expected 300, as its recorder counted",
-    ),
+def _lost_cycles(made: MadeUp) -> None:
+    made.cut(100, 200)
+
+
+def _chunk_twice(made: MadeUp) -> None:
+    made.repeat(100, 150)
+
+
+def _renumbered(made: MadeUp) -> None:
+    made.cut(100, 200)
+    made.cycle = _cycles(len(made.cycle))
+
+
+def _counted_missing(made: MadeUp) -> None:
+    made.statistics["missing"] = "[0, 1, 0, 0, 0, 0]"
+
+
+def _second_readback(made: MadeUp) -> None:
+    made.extra.append(attachment_record(READBACK, b'{"axes": []}'))
+
+
+def _second_run(made: MadeUp) -> None:
+    made.extra.append(metadata_record(RUN, sealed({"rate_hz": "1"})))
+
+
+def _second_summary(made: MadeUp) -> None:
+    made.after.append(metadata_record(STATISTICS, sealed({"valid": "true"})))
+
+
+#: a change of a sound log, and the message that refuses it
+CONTRADICTIONS: dict[str, tuple[Change, str]] = {
+    "chunks cut out": (_cut_out, "100 samples; expected 300, as its recorder counted"),
     "chunks cut out and not counted": (
         _cut_and_counted,
         "100 lost cycles; expected 0, as its recorder counted",
     ),
-    "a chunk twice": (lambda made: made.repeat(100, 150), "350 samples; expected 300"),
+    "a chunk twice": (_chunk_twice, "350 samples; expected 300"),
     "renumbered cycles": (_renumbered, "200 samples; expected 300"),
     "answers that were not missing": (
-        lambda made: made.statistics.update(missing="[0, 1, 0, 0, 0, 0]"),
+        _counted_missing,
         r"\[0, 0, 0, 0, 0, 0\] missing answers of its axes; expected \[0, 1",
     ),
-    "no samples": (lambda made: made.cut(0, 300), "no samples"),
-    "a second readback": (
-        _second(attachment_record(READBACK, b'{"axes": []}')),
-        "a second attachment 'readback.json'",
-    ),
-    "a second run": (
-        _second(metadata_record(RUN, sealed({"rate_hz": "1"}))),
-        "a second metadata 'drivegain.run'",
-    ),
-    "a second summary": (
-        _second(metadata_record(STATISTICS, sealed({"valid": "true"})), behind=True),
-        "a second metadata 'drivegain.statistics'",
-    ),
+    "no samples": (_without_samples, "no samples"),
+    "a second readback": (_second_readback, "a second attachment 'readback.json'"),
+    "a second run": (_second_run, "a second metadata 'drivegain.run'"),
+    "a second summary": (_second_summary, "a second metadata 'drivegain.statistics'"),
 }
 
 
@@ -205,7 +239,8 @@ def test_a_log_that_contradicts_itself_is_refused_by_all(
 def test_a_salvage_of_a_log_that_contradicts_itself_is_not_valid_or_refused(
     kind: str, made: MadeUp, tmp_path: Path
 ) -> None:
-    CONTRADICTIONS[kind][0](made)
+    change, _ = CONTRADICTIONS[kind]
+    change(made)
     try:
         damaged = made.write(tmp_path / "a.mcap")
         saved = salvage(damaged, tmp_path / "saved.mcap")
@@ -216,13 +251,10 @@ def test_a_salvage_of_a_log_that_contradicts_itself_is_not_valid_or_refused(
     assert read_log(saved.log).partial
 
 
-LOSSES: dict[str, tuple[Callable[[MadeUp], object], int, str]] = {
-    "lost cycles": (lambda made: made.cut(100, 200), 100, "cycle 210 after 109 (1 gaps)"),
-    "a chunk twice, counted": (
-        lambda made: made.repeat(100, 150),
-        0,
-        "cycle 110 after 159 (1 gaps)",
-    ),
+#: a change of a sound log, the lost cycles that are counted, and the reason that it is invalid
+LOSSES: dict[str, tuple[Change, int, str]] = {
+    "lost cycles": (_lost_cycles, 100, "cycle 210 after 109 (1 gaps)"),
+    "a chunk twice, counted": (_chunk_twice, 0, "cycle 110 after 159 (1 gaps)"),
     "renumbered and counted": (
         _renumbered,
         0,
@@ -245,27 +277,18 @@ def test_a_log_that_no_fit_takes_is_called_invalid_by_all(
     described = info_report(log)
     assert (described.valid, described.reason) == (False, reason)
     table = export_log(log, tmp_path / "a.csv", TableFormat.CSV)
+    assert (table.valid, table.reason) == (False, reason)
     bag = export_bag(log, tmp_path / "bag")
-    expected = (False, reason, False, reason)
-    assert (table.valid, table.reason, bag.valid, bag.reason) == expected
+    assert (bag.valid, bag.reason) == (False, reason)
     part = log.rename(tmp_path / "a.mcap.part")
     saved = salvage(part, tmp_path / "saved.mcap")
     assert (saved.statistics.valid, saved.statistics.reason) == (False, reason)
-    assert (
-        main(["export", "log", str(part), "--csv", "--out", str(tmp_path / "b.csv")]) == ExitCode.OK
-    )
+    arguments = ["export", "log", str(part), "--csv", "--out", str(tmp_path / "b.csv")]
+    assert main(arguments) == ExitCode.OK
     assert "INVALID" in capsys.readouterr().err
 
 
 # -- bounds
-# ------------------------------------------------------------------------------------------------
-
-
-def _serial(made: MadeUp) -> None:
-    readback = demo_content(made.checkout).readback
-    tree = json.loads(readback_bytes(readback))
-    tree["axes"][0]["drive"]["serial"] = int(ATTACKER_DIGITS)
-    made.readback = json.dumps(tree).encode()
 
 
 @pytest.mark.parametrize(
@@ -293,39 +316,41 @@ def test_a_number_of_400_digits_in_the_summary_is_refused(
 
 
 def test_a_serial_number_of_400_digits_is_none(made: MadeUp, tmp_path: Path) -> None:
-    _serial(made)
-    path = made.write(tmp_path / "a.mcap")
-    run, _ = load_run(path)
+    readback = json.loads(readback_bytes(demo_content(made.checkout).readback))
+    readback["axes"][0]["drive"]["serial"] = int(ATTACKER_DIGITS)
+    made.readback = json.dumps(readback).encode()
+    log = made.write(tmp_path / "a.mcap")
+    run, _ = load_run(log)
     assert run.recording is not None
-    expected = (None, 7, 7, 7, 7, 7)
-    assert run.recording.serials == expected
+    assert run.recording.serials == (None, 7, 7, 7, 7, 7)
 
 
-LARGE: dict[str, tuple[Callable[[MadeUp], object], str]] = {
-    "attachments": (
-        lambda made: made.extra.extend(
-            attachment_record(f"a{k}", b"") for k in range(LARGEST_ENTRIES)
-        ),
-        f"more than {LARGEST_ENTRIES} attachments",
-    ),
-    "metadata": (
-        lambda made: made.extra.extend(
-            metadata_record(f"a{k}", {}) for k in range(LARGEST_ENTRIES)
-        ),
-        f"more than {LARGEST_ENTRIES} attachments",
-    ),
-    "a text among the metadata": (
-        lambda made: made.run.update(operator="x" * 30_000_000),
-        "of 30000[0-9]+ bytes",
-    ),
-    "a text as its reason": (
-        lambda made: made.statistics.update(reason="x" * 30_000_000),
-        "of 30000[0-9]+ bytes",
-    ),
-    "an attachment": (
-        lambda made: made.extra.append(attachment_record("notes", b"x" * 30_000_000)),
-        "'notes' of 30000000 bytes",
-    ),
+def _many_attachments(made: MadeUp) -> None:
+    made.extra.extend(attachment_record(f"a{k}", b"") for k in range(LARGEST_ENTRIES))
+
+
+def _many_metadata(made: MadeUp) -> None:
+    made.extra.extend(metadata_record(f"a{k}", {}) for k in range(LARGEST_ENTRIES))
+
+
+def _long_operator(made: MadeUp) -> None:
+    made.run["operator"] = "x" * LONG_TEXT_BYTES
+
+
+def _long_reason(made: MadeUp) -> None:
+    made.statistics["reason"] = "x" * LONG_TEXT_BYTES
+
+
+def _long_attachment(made: MadeUp) -> None:
+    made.extra.append(attachment_record("notes", b"x" * LONG_TEXT_BYTES))
+
+
+LARGE: dict[str, tuple[Change, str]] = {
+    "attachments": (_many_attachments, f"more than {LARGEST_ENTRIES} attachments"),
+    "metadata": (_many_metadata, f"more than {LARGEST_ENTRIES} attachments"),
+    "a text among the metadata": (_long_operator, "of 30000[0-9]+ bytes"),
+    "a text as its reason": (_long_reason, "of 30000[0-9]+ bytes"),
+    "an attachment": (_long_attachment, "'notes' of 30000000 bytes"),
 }
 
 
@@ -342,27 +367,24 @@ def test_a_log_has_no_more_and_no_larger_texts_than_a_recorder_writes(
             read(log, tmp_path)
 
 
-def _messages(channel: int, data: bytes, count: int) -> bytes:
-    tobytes = np.array([channel], "<u2").tobytes()
-    body = tobytes + bytes(20) + data
-    return raw_record(5, body) * count
+def _message(channel: int, data: bytes) -> bytes:
+    """A message record: its channel, a number and two times that are zero, and its data."""
+    channel_bytes = channel.to_bytes(2, "little")
+    return raw_record(Opcode.MESSAGE, channel_bytes + bytes(20) + data)
 
 
-EVENT = event_bytes(CellEvent(START_NS, None, EventKind.STATE, 1, ""))
+def _event(text: str) -> bytes:
+    event = CellEvent(START_NS, None, EventKind.STATE, 1, text)
+    return _message(EVENT_CHANNEL, event_bytes(event))
 
 
 @pytest.mark.parametrize(
     ("message", "allowed"),
     [
-        (_messages(2, EVENT, 1), RECORDS // 2),
-        (
-            _messages(
-                2, event_bytes(CellEvent(START_NS, None, EventKind.STATE, 1, "x" * 6_400)), 1
-            ),
-            RECORDS // 100,
-        ),
-        (_messages(9, b"", 1), RECORDS),
-        (raw_record(0x80, b""), RECORDS),
+        (_event(""), RECORDS // 2),
+        (_event("x" * 6_400), RECORDS // 100),
+        (_message(UNKNOWN_CHANNEL, b""), RECORDS),
+        (raw_record(UNKNOWN_OPCODE, b""), RECORDS),
     ],
     ids=["events", "texts", "messages of no topic", "records of no kind"],
 )
@@ -371,17 +393,17 @@ def test_few_bytes_of_equal_messages_take_neither_gigabytes_nor_minutes(
 ) -> None:
     """The budget is that of a file; a hundredth of it keeps the test short."""
     monkeypatch.setattr("daq.log.container.RECORDS", RECORDS // 100)
-    made.extra.append(chunk_record(TOPICS + message * (2 * allowed // 100)))
+    count = 2 * allowed // 100
+    made.extra.append(chunk_record(TOPICS + message * count))
     log = made.write(tmp_path / "a.mcap")
     assert log.stat().st_size < 100_000
     reader = LogReader(log)
     with pytest.raises(LogUnreadable, match="too many messages for a file of its size"):
         list(reader)
-    assert len(reader.events) <= 2 * allowed // 100
+    assert len(reader.events) <= count
 
 
 # -- columns of an export
-# ----------------------------------------------------------------------------------------------
 
 NAMES = st.lists(st.text("A1_+-.", min_size=1, max_size=4), min_size=6, max_size=6, unique=True)
 
@@ -389,5 +411,6 @@ NAMES = st.lists(st.text("A1_+-.", min_size=1, max_size=4), min_size=6, max_size
 @given(NAMES)
 def test_every_axis_keeps_columns_of_its_own(cell: Cell, names: Sequence[str]) -> None:
     axes = tuple(replace(axis, name=name) for axis, name in zip(cell.axes, names, strict=True))
-    changed_cell = replace(cell, axes=axes)
-    assert len(set(column_names(changed_cell))) == 6
+    renamed_cell = replace(cell, axes=axes)
+    columns = column_names(renamed_cell)
+    assert len(set(columns)) == 6

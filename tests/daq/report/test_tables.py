@@ -8,7 +8,7 @@ import ast
 import io
 import re
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -23,6 +23,7 @@ from daq.cli.terminal import PIPE_COLUMNS
 from daq.config.cell import Cell
 from daq.jobs.cell_fit import Failure, Summary
 from daq.jobs.fleet import FleetRow, fleet_view
+from daq.ledger.fold import Entry
 from daq.ledger.ledger import read_history
 from daq.ledger.watch import Series, watch
 from daq.report import (
@@ -63,7 +64,7 @@ AXES = tuple(f"gantry-axis-number-{number}" for number in range(1, 15))
 GAINS = tuple(
     Gain(axis, -1234.5 - n, 0.0123 + 0.001 * n, "Nm/A", -1200.25 - n) for n, axis in enumerate(AXES)
 )
-ERROR = RelativeError(tuple(10.25 + n for n in range(14)), 12.34)
+ERROR = RelativeError(tuple(10.25 + n for n in range(len(AXES))), 12.34)
 CALIBRATION = replace(demo_calibration(), gains=GAINS, relative_error_percent=ERROR)
 
 
@@ -74,32 +75,38 @@ def long_named_cell(cell: Cell) -> Cell:
     return replace(cell, axes=axes)
 
 
+@dataclass(frozen=True)
+class KnownHistory:
+    """Entries of a history, its series by axis, and what was done with each calibration."""
+
+    entries: tuple[Entry, ...]
+    series: tuple[Series, ...]
+    actions: dict[str, str]
+
+
 @pytest.fixture(scope="module")
-def series(
-    tmp_path_factory: pytest.TempPathFactory,
-) -> tuple[Any, tuple[Series, ...], dict[str, str]]:
-    """Entries of a history, its series, and what was done with each calibration."""
+def known_history(tmp_path_factory: pytest.TempPathFactory) -> KnownHistory:
+    """Six weeks in which the gain of the fourth axis drifts."""
     ledger = ledger_in(tmp_path_factory.mktemp("tables"))
     fill(ledger, 6, lambda week: (1.0, 1.0, 1.0, 1.0 + 0.01 * week, 1.0, 1.0))
     entries = read_history(ledger).entries
-    actions = {
-        entry.digest: "applied by a person with quite a long name, rolled back by another"
-        for entry in entries
-    }
-    return entries, watch(entries, ()), actions
+    action = "applied by a person with quite a long name, rolled back by another"
+    actions = {entry.digest: action for entry in entries}
+    return KnownHistory(entries, watch(entries, ()), actions)
 
 
-def _scan(cell: Cell, _: Any) -> Iterator[RenderableType]:
+# Each example below makes the tables of one view, from the longest values that it may meet.
+
+
+def _scan(cell: Cell, _: KnownHistory) -> Iterator[RenderableType]:
     nodes = [_node(number) for number in range(14)]
     yield bus_views.scan_table(nodes)
 
 
 def _node(number: int) -> ScannedNode:
-    bus = f"bus-{number % 2}"
-    node_id = 101 + number
     return ScannedNode(
-        bus=bus,
-        node_id=node_id,
+        bus=f"bus-{number % 2}",
+        node_id=101 + number,
         axis=AXES[number],
         vendor_id=0xFFFFFFFF,
         product_code=0xFFFFFFFE,
@@ -114,7 +121,7 @@ def _node(number: int) -> ScannedNode:
     )
 
 
-def _monitor(cell: Cell, _: Any) -> Iterator[RenderableType]:
+def _monitor(cell: Cell, _: KnownHistory) -> Iterator[RenderableType]:
     axis = AxisReading(
         position_counts=-123456,
         current_raw=-32768,
@@ -125,16 +132,13 @@ def _monitor(cell: Cell, _: Any) -> Iterator[RenderableType]:
         delay_s=1.2,
     )
     frames = ((0,) * 9,)
-    axes = (axis,) * 6
-    reading = CellReading(ReadingSource.ASKED, 0.5, axes, 1000.0, frames, ())
+    reading = CellReading(ReadingSource.ASKED, 0.5, (axis,) * 6, 1000.0, frames, ())
     current = RecentCurrent(-12.345, -11.234, 0.123, 1.234, 0.99, True)
-    position = [-3.126 - number for number in range(6)]
     prediction = CellPrediction(payload="disc", remark="", axes=[current] * 6)
-    ampere = [12.345 / 32768] * 6
     watched = WatchedCell(
         reading,
-        position=position,
-        ampere=ampere,
+        position=[-3.126 - number for number in range(6)],
+        ampere=[12.345 / 32768] * 6,
         events=(),
         prediction=prediction,
     )
@@ -142,15 +146,14 @@ def _monitor(cell: Cell, _: Any) -> Iterator[RenderableType]:
     yield bus_views.monitor_view(report)
 
 
-def _comparison(cell: Cell, _: Any) -> Iterable[RenderableType]:
+def _comparison(cell: Cell, _: KnownHistory) -> Iterable[RenderableType]:
     values = np.array([gain.value for gain in GAINS])
-    trials = tuple(
-        EstimatorTrial(name, 40.0, 20.0, values, np.full(14, 12.34), 123.45) for name in ESTIMATORS
-    )
+    std = np.full(len(GAINS), 12.34)
+    trials = tuple(EstimatorTrial(name, 40.0, 20.0, values, std, 123.45) for name in ESTIMATORS)
     return fit.comparison_tables(EstimatorComparison(trials), AXES)
 
 
-def _turns(cell: Cell, _: Any) -> Iterator[RenderableType]:
+def _turns(cell: Cell, _: KnownHistory) -> Iterator[RenderableType]:
     after: Any = None  # the table needs nothing of it
     effect = SimpleNamespace(name="position-dependent-friction")
     finding: Any = SimpleNamespace(
@@ -163,106 +166,98 @@ def _turns(cell: Cell, _: Any) -> Iterator[RenderableType]:
         error_after_percent=112.34,
         passed=True,
     )
-    findings = (finding,) * 6
     limits_nm = np.ones(6)
-    step = Step(findings, (), limits_nm, None, after)
+    step = Step((finding,) * 6, (), limits_nm, None, after)
     fitted: Any = SimpleNamespace(steps=(step,), cell=cell)
     return residual.turns_view(fitted)
 
 
-def _validation(cell: Cell, _: Any) -> Iterator[RenderableType]:
+def _validation(cell: Cell, _: KnownHistory) -> Iterator[RenderableType]:
     rng = np.random.default_rng(1)
-    measured = rng.normal(size=(14, 50))
-    use = np.ones(measured.shape, dtype=bool)
-    predicted_nm = 0.9 * measured
-    one: Any = SimpleNamespace(
+    measured_nm = rng.normal(size=(14, 50))
+    held_out: Any = SimpleNamespace(
         run="a run with a long name, 2026-03-02",
         log=Path("run.mcap"),
         error=ERROR,
         data_use=DataUse.HOLDOUT,
         same_configuration=True,
-        measured_nm=measured,
-        predicted_nm=predicted_nm,
-        use=use,
+        measured_nm=measured_nm,
+        predicted_nm=0.9 * measured_nm,
+        use=np.ones(measured_nm.shape, dtype=bool),
     )
     checked = SimpleNamespace(run="run-1", condition=1234.0, left_out="")
-    runs = (checked,) * 12
     found: Any = SimpleNamespace(
-        validations=(one, one), diagnoses=(), runs=runs, calibrations=("ml",), weighed=()
+        validations=(held_out, held_out),
+        diagnoses=(),
+        runs=(checked,) * 12,
+        calibrations=("ml",),
+        weighed=(),
     )
     calibration = replace(CALIBRATION, filter=Conditioning().document())
     return validation.validation_view(calibration, found)
 
 
-def _weighed(cell: Cell, _: Any) -> Iterator[RenderableType]:
-    centre_m = (np.full(3, -0.12345), np.full(3, 0.000123))
-    inertia_kg_m2 = (np.full(6, 0.0123456), np.full(6, 0.00000123))
-    identifiable = np.ones(10, dtype=bool)
-    std = np.full(10, 0.00000123)
-    grid = np.linspace(-0.0123456, 12.3, 10)
+def _weighed(cell: Cell, _: KnownHistory) -> Iterator[RenderableType]:
     body: Any = SimpleNamespace(
-        centre_m=centre_m,
-        inertia_kg_m2=inertia_kg_m2,
+        centre_m=(np.full(3, -0.12345), np.full(3, 0.000123)),
+        inertia_kg_m2=(np.full(6, 0.0123456), np.full(6, 0.00000123)),
         mass_kg=12.34567,
         mass_std_kg=0.00123,
         mass_reference_std_kg=0.00045,
         complete=True,
         moves=123,
         error=ERROR,
-        values=grid,
-        std=std,
-        identifiable=identifiable,
+        values=np.linspace(-0.0123456, 12.3, 10),
+        std=np.full(10, 0.00000123),
+        identifiable=np.ones(10, dtype=bool),
     )
     found: Any = SimpleNamespace(cell=cell, body=body, declared_kg=12.3, bare=(), help=())
     return weighing_views.weighed_view(found)
 
 
-def _contact(cell: Cell, _: Any) -> Iterator[RenderableType]:
+def _contact(cell: Cell, _: KnownHistory) -> Iterator[RenderableType]:
     contact = SimpleNamespace(
-        axis=2, start_s=12345.67, end_s=12346.78, peak_nm=-1234.0, peak_over_threshold=12.34
+        axis=2,
+        start_s=12345.67,
+        end_s=12346.78,
+        peak_nm=-1234.0,
+        peak_over_threshold=12.34,
     )
-    n = len(cell.axes)
-    ones = np.ones((n, 9))
-    quiet_s = np.full(n, 12345.0)
-    threshold = np.ones(n)
-    band = SimpleNamespace(quiet_s=quiet_s, threshold=threshold, alarms_per_hour=0.1)
-    band.correlation_s = np.ones(n)
-    band.factor = np.ones(n)
-    band.scale = ones
-    contacts = (contact,) * 20
-    band_nm = 1.234e4 * ones
-    threshold_nm = 2.345e4 * ones
-    torque_nm = 3.456e5 * ones
-    time_s = np.arange(9.0)
+    count = len(cell.axes)
+    ones = np.ones((count, 9))
+    band = SimpleNamespace(
+        quiet_s=np.full(count, 12345.0),
+        threshold=np.ones(count),
+        alarms_per_hour=0.1,
+        correlation_s=np.ones(count),
+        factor=np.ones(count),
+        scale=ones,
+    )
     found: Any = SimpleNamespace(
         band=band,
-        band_nm=band_nm,
-        threshold_nm=threshold_nm,
-        torque_nm=torque_nm,
+        band_nm=1.234e4 * ones,
+        threshold_nm=2.345e4 * ones,
+        torque_nm=3.456e5 * ones,
         use=ones > 0,
         left_out=0,
         from_itself=False,
-        contacts=contacts,
-        time_s=time_s,
+        contacts=(contact,) * 20,
+        time_s=np.arange(9.0),
     )
     return weighing_views.contact_view(found, cell)
 
 
-def _urdf(cell: Cell, _: Any) -> Iterator[RenderableType]:
-    centre_m = (-1.234, 2.345, -3.456)
-    body = SimpleNamespace(centre_m=centre_m, mass_kg=123.0)
+def _urdf(cell: Cell, _: KnownHistory) -> Iterator[RenderableType]:
+    body = SimpleNamespace(centre_m=(-1.234, 2.345, -3.456), mass_kg=123.0)
     update: Any = SimpleNamespace(body=body, damping=1.23e-5, friction=4.56e-5)
-    robot = SimpleNamespace(joints=(), closures=())
-    drive_train = SimpleNamespace(coupled=())
     model = SimpleNamespace(
-        robot=robot,
-        drive_train=drive_train,
+        robot=SimpleNamespace(joints=(), closures=()),
+        drive_train=SimpleNamespace(coupled=()),
         columns=(),
     )
     parameters = SimpleNamespace(torque_change_percent=ERROR, exact=True, model=model)
-    simple_namespace = SimpleNamespace(parameters=parameters)
     choice: Any = SimpleNamespace(
-        robot=simple_namespace,
+        robot=SimpleNamespace(parameters=parameters),
         model=model,
         chosen_by=ChosenBy.NEAREST_BODIES,
         assumed=(),
@@ -273,21 +268,10 @@ def _urdf(cell: Cell, _: Any) -> Iterator[RenderableType]:
     return urdf_views.urdf_view(CALIBRATION, choice, updates, updated, None)
 
 
-def _mjcf(cell: Cell, _: Any) -> Iterator[RenderableType]:
-    centre_m = (-1.2345, 2.3456, -3.4567)
-    joint = SimpleNamespace(
-        mass_kg=123.456,
-        centre_m=centre_m,
-        armature=1.23e-5,
-        damping=4.56e-5,
-        friction=1234.5,
-    )
-    left = SimpleNamespace(name="off12", value=-1.234e-5, unit="Nm")
-    joints = [SimpleNamespace(name=axis, **vars(joint)) for axis in AXES]
-    actuators = [
-        SimpleNamespace(axis=one.axis, acts_on=f"tendon {one.axis}", gear=one.value, unit="Nm/A")
-        for one in GAINS
-    ]
+def _mjcf(cell: Cell, _: KnownHistory) -> Iterator[RenderableType]:
+    joints = [_mjcf_joint(axis) for axis in AXES]
+    actuators = [_mjcf_actuator(gain) for gain in GAINS]
+    left_out = SimpleNamespace(name="off12", value=-1.234e-5, unit="Nm")
     parameters = [SimpleNamespace(name="Ixx12", basis="prior")]
     report: Any = SimpleNamespace(
         joints=joints,
@@ -297,7 +281,7 @@ def _mjcf(cell: Cell, _: Any) -> Iterator[RenderableType]:
         parameters=parameters,
         chosen_by="bodies nearest to the URDF",
         assumed_links=[],
-        not_in_mjcf=[left],
+        not_in_mjcf=[left_out],
         shapes_left_out=["visual of link1: no file 'arm.stl' next to or above the URDF"],
         effects_left_out=[],
         mountings_left_out=[],
@@ -307,81 +291,108 @@ def _mjcf(cell: Cell, _: Any) -> Iterator[RenderableType]:
     return mjcf_views.mjcf_view(report)
 
 
-def _full(cell: Cell, _: Any) -> Iterator[RenderableType]:
-    full_parameter = FullParameter(
-        "Ixx12", -1.2345e-17, 1.2e-5, "kg m²", "prior", 1.0, 123.45, 1.2e-5
+def _mjcf_joint(axis: str) -> SimpleNamespace:
+    return SimpleNamespace(
+        name=axis,
+        mass_kg=123.456,
+        centre_m=(-1.2345, 2.3456, -3.4567),
+        armature=1.23e-5,
+        damping=4.56e-5,
+        friction=1234.5,
     )
-    parameters = (
-        full_parameter,
-        FullParameter("fvm12", 1.234e-5, 1.2e-6, "Nm/(rad/s)", "data", 0.0, None, None),
-    )
-    others = tuple(GainWithPrior(gain.axis, gain.value, gain.std) for gain in GAINS)
-    urdf_sha256 = "a" * 64
-    full = FullSet("arm.urdf", urdf_sha256, 0.1, parameters, others, True, 1.0, 1, 1.0, 0.1, ())
-    calibration = replace(CALIBRATION, gains=tuple(GAINS))
-    return full_parameters.full_parameter_view(calibration, full)
 
 
-def _fleet(cell: Cell, _: Any) -> Iterator[RenderableType]:
+def _mjcf_actuator(gain: Gain) -> SimpleNamespace:
+    return SimpleNamespace(
+        axis=gain.axis, acts_on=f"tendon {gain.axis}", gear=gain.value, unit="Nm/A"
+    )
+
+
+def _full(cell: Cell, _: KnownHistory) -> Iterator[RenderableType]:
+    of_prior = FullParameter("Ixx12", -1.2345e-17, 1.2e-5, "kg m²", "prior", 1.0, 123.45, 1.2e-5)
+    of_data = FullParameter("fvm12", 1.234e-5, 1.2e-6, "Nm/(rad/s)", "data", 0.0, None, None)
+    parameters = (of_prior, of_data)
+    with_prior = tuple(GainWithPrior(gain.axis, gain.value, gain.std) for gain in GAINS)
+    sha256 = "a" * 64
+    full = FullSet("arm.urdf", sha256, 0.1, parameters, with_prior, True, 1.0, 1, 1.0, 0.1, ())
+    return full_parameters.full_parameter_view(CALIBRATION, full)
+
+
+def _fleet(cell: Cell, _: KnownHistory) -> Iterator[RenderableType]:
     effects = (("load-friction", AXES[3]),)
     summary = Summary(GAINS, effects, 3.21, held_out=False, partial=True)
     failure = Failure("DataUnfit", "run-17.mcap lost 1234 samples", 4)
-    results: tuple[Summary | Failure, ...] = (
-        summary,
-        failure,
-    )
-    names = ("press-4-in-hall-12-line-7", "gantry-23")
-    rows = [
-        FleetRow(name, "c" * 64, (), (), one, 1234.56)
-        for name, one in zip(names, results, strict=True)
-    ]
-    return fleet_view(rows)
+    fitted = FleetRow("press-4-in-hall-12-line-7", "c" * 64, (), (), summary, 1234.56)
+    failed = FleetRow("gantry-23", "c" * 64, (), (), failure, 1234.56)
+    return fleet_view([fitted, failed])
 
 
-def _changes(cell: Cell, _: Any) -> Iterator[RenderableType]:
-    changes = tuple(
-        GainChange(
-            one.axis,
+def _changes(cell: Cell, _: KnownHistory) -> Iterator[RenderableType]:
+    changes = []
+    for number, gain in enumerate(GAINS):
+        change = GainChange(
+            gain.axis,
             "drives.gain",
-            n,
-            one.nameplate,
-            one.value,
-            one.std,
-            one.unit,
-            one.nameplate,
+            number,
+            gain.nameplate,
+            gain.value,
+            gain.std,
+            gain.unit,
+            gain.nameplate,
             "1",
         )
-        for n, one in enumerate(GAINS)
-    )
-    yield proposal.change_table(changes, NOTHING)
+        changes.append(change)
+    yield proposal.change_table(tuple(changes), NOTHING)
 
 
-def _paper(cell: Cell, _: Any) -> Iterator[RenderableType]:
-    rows = (("zz1", *("1.2345678",) * 6),)
+def _paper(cell: Cell, _: KnownHistory) -> Iterator[RenderableType]:
     headings = ("parameter", *("10 CAD: value",) * 6)
-    return paper_tables.PaperTable("Table 1", headings, rows).view()
+    row = ("zz1", *("1.2345678",) * 6)
+    return paper_tables.PaperTable("Table 1", headings, (row,)).view()
 
 
-EXAMPLES: dict[str, Callable[[Cell, Any], Iterable[RenderableType]]] = {
+def _error(cell: Cell, _: KnownHistory) -> Iterator[RenderableType]:
+    yield fit.error_table("Error", AXES, {"held out, before": ERROR})
+
+
+def _gain(cell: Cell, _: KnownHistory) -> Iterator[RenderableType]:
+    truth = dict.fromkeys(AXES, -1230.5)
+    yield gains.gain_table(GAINS, truth, title="Gains")
+
+
+def _torque(cell: Cell, _: KnownHistory) -> Iterator[RenderableType]:
+    slope = TorqueSlope(-1250.0, 0.0123, 98765)
+    yield gains.torque_table([slope] * len(GAINS), GAINS)
+
+
+def _history_of_axis(cell: Cell, known: KnownHistory) -> Iterator[RenderableType]:
+    yield history.axis_table(known.series[3], known.actions)
+
+
+def _history_of_calibrations(cell: Cell, known: KnownHistory) -> Iterator[RenderableType]:
+    yield history.calibration_table(known.entries, known.series, known.actions)
+
+
+def _history_of_gains(cell: Cell, known: KnownHistory) -> Iterator[RenderableType]:
+    yield history.history_gain_table(known.series)
+
+
+Example = Callable[[Cell, KnownHistory], Iterable[RenderableType]]
+
+EXAMPLES: dict[str, Example] = {
     "bus_views.monitor_view": _monitor,
     "bus_views.prediction_view": _monitor,
     "bus_views.scan_table": _scan,
     "fit.comparison_tables": _comparison,
-    "fit.error_table": lambda _cell, _: [
-        fit.error_table("Error", AXES, {"held out, before": ERROR})
-    ],
+    "fit.error_table": _error,
     "fleet.fleet_view": _fleet,
     "full_parameters.full_parameter_table": _full,
     "full_parameters.gains_with_prior_table": _full,
-    "gains.gain_table": lambda _cell, _: [
-        gains.gain_table(GAINS, dict.fromkeys(AXES, -1230.5), title="Gains")
-    ],
-    "gains.torque_table": lambda _cell, _: [
-        gains.torque_table([TorqueSlope(-1250.0, 0.0123, 98765)] * 14, GAINS)
-    ],
-    "history.axis_table": lambda _cell, known: [history.axis_table(known[1][3], known[2])],
-    "history.calibration_table": lambda _cell, known: [history.calibration_table(*known)],
-    "history.history_gain_table": lambda _cell, known: [history.history_gain_table(known[1])],
+    "gains.gain_table": _gain,
+    "gains.torque_table": _torque,
+    "history.axis_table": _history_of_axis,
+    "history.calibration_table": _history_of_calibrations,
+    "history.history_gain_table": _history_of_gains,
     "mjcf_views.mjcf_view": _mjcf,
     "paper_tables.view": _paper,
     "proposal.change_table": _changes,
@@ -394,16 +405,17 @@ EXAMPLES: dict[str, Callable[[Cell, Any], Iterable[RenderableType]]] = {
 """One for each function that makes a table, by file and name."""
 
 
-def _calls(tree: ast.AST) -> set[str]:
-    return {
-        node.func.id
-        for node in ast.walk(tree)
-        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name)
-    }
+def _called_names(tree: ast.AST) -> set[str]:
+    names = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
+            names.add(node.func.id)
+    return names
 
 
 @pytest.mark.slow
 def test_every_function_that_makes_a_table_has_an_example(checkout: Path) -> None:
+    makes_table = {"plain_table", "WholeTable"}
     makers = set()
     others = set()
     for path in (checkout / "daq").rglob("*.py"):
@@ -411,13 +423,10 @@ def test_every_function_that_makes_a_table_has_an_example(checkout: Path) -> Non
             continue
         source = path.read_text(encoding="utf-8")
         tree = ast.parse(source)
-        functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
-        makers |= {
-            f"{path.stem}.{one.name}"
-            for one in functions
-            if {"plain_table", "WholeTable"} & _calls(one)
-        }
-        if "rich.table" in source and "Table" in _calls(tree):
+        for node in ast.walk(tree):
+            if isinstance(node, ast.FunctionDef) and makes_table & _called_names(node):
+                makers.add(f"{path.stem}.{node.name}")
+        if "rich.table" in source and "Table" in _called_names(tree):
             others.add(path.name)
     assert makers == EXAMPLES.keys()
     assert others == set(), "use plain_table of daq/report/text.py, whose tables never cut a value"
@@ -431,61 +440,61 @@ def _tables(parts: Iterable[RenderableType]) -> Iterator[Table]:
             yield part
 
 
+def _numbers(table: Table) -> list[str]:
+    """Words of a table that have a digit in them."""
+    numbers: list[str] = []
+    for column in table.columns:
+        for value in (column.header, *column.cells):
+            words = str(value).split()
+            numbers.extend(word for word in words if re.search(r"\d", word))
+    return numbers
+
+
+def _printed(table: Table, width: int, **settings: Any) -> str:
+    out = io.StringIO()
+    Console(file=out, width=width, soft_wrap=True, **settings).print(table)
+    return out.getvalue()
+
+
 @pytest.mark.parametrize("name", EXAMPLES)
 def test_every_number_of_a_table_is_whole_at_80_columns_and_in_a_pipe(
-    name: str, long_named_cell: Cell, series: Any
+    name: str, long_named_cell: Cell, known_history: KnownHistory
 ) -> None:
-    parts = EXAMPLES[name](long_named_cell, series)
+    parts = EXAMPLES[name](long_named_cell, known_history)
     tables = list(_tables(parts))
     assert tables
     for table in tables:
         assert isinstance(table, WholeTable)
-        words = []
-        for column in table.columns:
-            for value in (column.header, *column.cells):
-                words.extend(str(value).split())
-        for width, terminal in ((80, True), (PIPE_COLUMNS, False)):
-            out = io.StringIO()
-            console = Console(
-                file=out,
-                width=width,
-                force_terminal=terminal,
-                color_system=None,
-                soft_wrap=True,
-                highlight=False,
+        numbers = _numbers(table)
+        for width, is_terminal in ((80, True), (PIPE_COLUMNS, False)):
+            shown = _printed(
+                table, width, force_terminal=is_terminal, color_system=None, highlight=False
             )
-            console.print(table)
-            shown = out.getvalue()
             assert "…" not in shown
-            assert [word for word in words if re.search(r"\d", word) and word not in shown] == []
+            assert [number for number in numbers if number not in shown] == []
             assert max(cell_len(line.rstrip()) for line in shown.splitlines()) <= width
 
 
 def test_a_row_keeps_its_style_in_every_form() -> None:
+    bold_red = "\x1b[1;31m"
     for width in (20, 40, 80):
-        out = io.StringIO()
         table = WholeTable()
         for heading in ("axis", "state", "another"):
             table.add_column(heading, no_wrap=True)
         table.add_row("J1", "x" * 15, "y" * 15, style="bold red")
-        console = Console(
-            file=out, width=width, force_terminal=True, color_system="standard", soft_wrap=True
-        )
-        console.print(table)
-        assert out.getvalue().count("\x1b[1;31m") >= 2
+        shown = _printed(table, width, force_terminal=True, color_system="standard")
+        assert shown.count(bold_red) >= 2
 
 
 def test_an_error_of_a_fleet_is_below_its_table() -> None:
     text = "run-17.mcap: " + "found words of a long error; " * 10
-    result = Failure("DataUnfit", text, 4)
-    configuration_sha256 = "c" * 64
-    fleet_row = FleetRow("press-4", configuration_sha256, (), (), result, 1.0)
-    rows = [fleet_row]
-    table, *below = fleet_view(rows)
+    failure = Failure("DataUnfit", text, 4)
+    failed = FleetRow("press-4", "c" * 64, (), (), failure, 1.0)
+    table, *below = fleet_view([failed])
     assert isinstance(table, WholeTable)
     for column in table.columns:
         assert max(len(str(value)) for value in column.cells) < 40
-    assert any(str(line) == f"press-4: DataUnfit: {text}" for line in below)
+    assert f"press-4: DataUnfit: {text}" in [str(line) for line in below]
 
 
 def test_numbers_of_a_log_have_no_exponent_and_none_that_a_person_has_no_use_for() -> None:
@@ -513,4 +522,6 @@ def test_a_log_is_described_in_whole_words() -> None:
     lines = [str(line) for line in log_lines(described, 80)]
     assert max(map(cell_len, lines)) <= 80
     assert f"  {digest}" in lines
-    assert all(f"J{n} {100 + n}" in " ".join("\n".join(lines).split()) for n in range(40))
+    words = " ".join("\n".join(lines).split())
+    for n in range(40):
+        assert f"J{n} {100 + n}" in words

@@ -13,30 +13,37 @@ import pytest
 
 from daq.workflow.mesh_files import ShapeUnreadable, check_mesh
 
+# A tetrahedron: as text for OBJ, as arrays for STL and MSH.
 CORNERS = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\n"
 FACES = "f 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
 OTHER_BODY = "v 5 5 5\nv 6 5 5\nv 5 6 5\nv 5 5 6\nf 5 7 6\nf 5 6 8\nf 5 8 7\nf 6 7 8\n"
 POINTS = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
 TRIANGLES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
-WHOLE = (1.0, 1.0, 1.0)
+FULL_SIZE = (1.0, 1.0, 1.0)
 
 
 def stl(points: np.ndarray, triangles: np.ndarray = TRIANGLES) -> bytes:
     """A binary STL."""
-    packed = struct.pack("<I", len(triangles))
-    parts = [bytes(80), packed]
-    for triangle in triangles:
-        parts.append(struct.pack("<12fH", 0, 0, 1, *points[triangle].ravel(), 0))
-    return b"".join(parts)
+    title = bytes(80)
+    count = struct.pack("<I", len(triangles))
+    facets = [facet(points[triangle]) for triangle in triangles]
+    return b"".join((title, count, *facets))
+
+
+def facet(corners: np.ndarray) -> bytes:
+    """A triangle of a binary STL: its normal, its three corners and a number without a meaning."""
+    normal = (0, 0, 1)
+    return struct.pack("<12fH", *normal, *corners.ravel(), 0)
 
 
 def msh(points: np.ndarray, triangles: np.ndarray = TRIANGLES, normals: int = 0) -> bytes:
     """A mesh of MuJoCo."""
-    counts = struct.pack("<4i", len(points), normals, 0, len(triangles))
-    of_normals = np.ones((normals, 3), "<f4").tobytes()
-    corners = np.asarray(points, "<f4").tobytes()
-    tobytes = np.asarray(triangles, "<i4").tobytes()
-    return counts + corners + of_normals + tobytes
+    texture_points = 0
+    counts = struct.pack("<4i", len(points), normals, texture_points, len(triangles))
+    point_bytes = np.asarray(points, "<f4").tobytes()
+    normal_bytes = np.ones((normals, 3), "<f4").tobytes()
+    triangle_bytes = np.asarray(triangles, "<i4").tobytes()
+    return counts + point_bytes + normal_bytes + triangle_bytes
 
 
 def moved(place: int, value: float) -> np.ndarray:
@@ -46,7 +53,15 @@ def moved(place: int, value: float) -> np.ndarray:
     return points
 
 
-def faces_in_mujoco(path: Path, scale: tuple[float, ...] = WHOLE) -> int:
+def written(path: Path, content: str | bytes) -> Path:
+    """The path, with the content in its file."""
+    if isinstance(content, str):
+        content = content.encode()
+    path.write_bytes(content)
+    return path
+
+
+def faces_in_mujoco(path: Path, scale: tuple[float, ...] = FULL_SIZE) -> int:
     """Number of triangles that MuJoCo has of a mesh.
 
     Raises:
@@ -65,16 +80,22 @@ def faces_in_mujoco(path: Path, scale: tuple[float, ...] = WHOLE) -> int:
         mujoco.set_mju_user_warning(None)
 
 
+QUAD_AND_TRIANGLE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nv 0 0 1\nf 1 2 3 4\nf 1 2 5\n"
+FLAT_CORNERS = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\n"
+CORNERS_ON_A_LINE = "v 0 0 0\nv 1 0 0\nv 2 0 0\nv 3 0 0\n"
+POINTS_ON_A_LINE = np.outer(np.arange(4.0), np.ones(3))
+
+#: a file that MuJoCo reads, and the number of its triangles
 READ: dict[str, tuple[str | bytes, int]] = {
     "plain.obj": (CORNERS + FACES, 4),
     "windows.OBJ": ((CORNERS + FACES).replace("\n", "\r\n"), 4),
     "before.obj": (FACES + CORNERS, 4),
     "back.obj": (CORNERS + "f -4 -2 -3\nf -4 -3 -1\nf -4 -1 -2\nf -3 -2 -1\n", 4),
-    "polygon.obj": ("v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nv 0 0 1\nf 1 2 3 4\nf 1 2 5\n", 3),
+    "polygon.obj": (QUAD_AND_TRIANGLE, 3),
     "named.obj": ("mtllib a.mtl\no arm\n" + CORNERS + "usemtl a\ns off\n" + FACES, 4),
     "normals.obj": (CORNERS + "vn 0 0 1\nf 1//1 3//1 2//1\nf 1//-1 2//-1 4//-1\n", 2),
     "texture.obj": (CORNERS + "vt 0 0\nvn 0 0 1\nf 1/1/1 3/1/1 2/1/1\nf 1/1/1 2/1/1 4/1/1\n", 2),
-    "flat.obj": ("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\nf 1 2 3\nf 2 4 3\n", 2),
+    "flat.obj": (FLAT_CORNERS + "f 1 2 3\nf 2 4 3\n", 2),
     "colours.obj": (CORNERS.replace("\n", " 1 0 0\n") + FACES, 4),
     "line.obj": (CORNERS + FACES + "l 1 2\n", 4),
     "plain.stl": (stl(POINTS), 4),
@@ -87,12 +108,12 @@ READ: dict[str, tuple[str | bytes, int]] = {
 @pytest.mark.parametrize("name", READ)
 def test_a_mesh_that_mujoco_reads_is_taken(name: str, tmp_path: Path) -> None:
     content, faces = READ[name]
-    path = tmp_path / name
-    path.write_bytes(content if isinstance(content, bytes) else content.encode())
-    check_mesh(path, WHOLE)
+    path = written(tmp_path / name, content)
+    check_mesh(path, FULL_SIZE)
     assert faces_in_mujoco(path) == faces
 
 
+#: a file that MuJoCo refuses, and the reason that is given
 REFUSED: dict[str, tuple[str | bytes, str]] = {
     "empty.obj": ("", "0 vertices"),
     "page.obj": ("<html>not found</html>", "0 vertices"),
@@ -103,15 +124,15 @@ REFUSED: dict[str, tuple[str | bytes, str]] = {
     "continued.obj": (CORNERS + "f 1 3 \\\n2\n" + FACES, "line 5"),
     "nan.obj": (CORNERS + "v nan 0 0\n" + FACES, "no finite numbers"),
     "one-point.obj": ("v 0 0 0\n" * 4 + FACES, "faces of 0 m²"),
-    "one-line.obj": ("v 0 0 0\nv 1 0 0\nv 2 0 0\nv 3 0 0\n" + FACES, "faces of 0 m²"),
-    "flat.obj": ("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\n", "faces of 0 m²"),
+    "one-line.obj": (CORNERS_ON_A_LINE + FACES, "faces of 0 m²"),
+    "flat.obj": (FLAT_CORNERS, "faces of 0 m²"),
     "mixed.obj": (CORNERS + "vn 0 0 1\nf 1//1 3//1 2//1\n" + FACES, "without a normal"),
     "normal.obj": (CORNERS + "vn 0 0 1\nf 1//9 3//9 2//9\n", "without a normal"),
     "nan.stl": (stl(moved(0, np.nan)), "no finite numbers"),
     "far.stl": (stl(moved(0, 1e38)), "no finite numbers"),
     "one-point.stl": (stl(0.0 * POINTS), "1 vertices"),
     "one-triangle.stl": (stl(POINTS, TRIANGLES[[0, 0]]), "3 vertices"),
-    "one-line.stl": (stl(np.outer(np.arange(4.0), np.ones(3))), "faces of 0 m²"),
+    "one-line.stl": (stl(POINTS_ON_A_LINE), "faces of 0 m²"),
     "cut.stl": (stl(POINTS)[:-7], "was cut"),
     "empty.msh": (b"", "no MSH"),
     "cut.msh": (msh(POINTS)[:-4], "no MSH"),
@@ -127,29 +148,30 @@ REFUSED: dict[str, tuple[str | bytes, str]] = {
 @pytest.mark.parametrize("name", REFUSED)
 def test_a_mesh_that_mujoco_refuses_is_named(name: str, tmp_path: Path) -> None:
     content, reason = REFUSED[name]
-    path = tmp_path / name
-    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    path = written(tmp_path / name, content)
     with pytest.raises(ShapeUnreadable) as caught:
-        check_mesh(path, WHOLE)
-    assert str(caught.value).startswith(f"{name} ")
-    assert reason in str(caught.value)
+        check_mesh(path, FULL_SIZE)
+    message = str(caught.value)
+    assert message.startswith(f"{name} ")
+    assert reason in message
     with pytest.raises(ValueError, match="Error"):
         faces_in_mujoco(path)
 
 
 def test_an_obj_of_several_bodies_is_refused_because_mujoco_shows_the_first(tmp_path: Path) -> None:
-    path = tmp_path / "arm.obj"
-    path.write_text("o upper\n" + CORNERS + FACES + "o lower\n" + OTHER_BODY)
+    upper = "o upper\n" + CORNERS + FACES
+    lower = "o lower\n" + OTHER_BODY
+    path = written(tmp_path / "arm.obj", upper + lower)
     assert faces_in_mujoco(path) == 4  # of 8
     with pytest.raises(ShapeUnreadable, match="2 objects or groups, where only the first is read"):
-        check_mesh(path, WHOLE)
+        check_mesh(path, FULL_SIZE)
 
 
 def test_the_scale_decides_whether_a_mesh_has_an_area(tmp_path: Path) -> None:
-    path = tmp_path / "arm.obj"
-    path.write_text(CORNERS + FACES)
-    check_mesh(path, (1e-3, 1e-3, -1e-3))
+    path = written(tmp_path / "arm.obj", CORNERS + FACES)
+    mirrored_millimetres = (1e-3, 1e-3, -1e-3)
     tiny = (1e-8, 1e-8, 1e-8)
+    check_mesh(path, mirrored_millimetres)
     with pytest.raises(ShapeUnreadable, match="check its scale"):
         check_mesh(path, tiny)
     with pytest.raises(ValueError, match="area is too small"):

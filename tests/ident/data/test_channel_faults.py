@@ -4,7 +4,7 @@ left out or refused.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -13,8 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from ident.data.channel_faults import ChannelKind, FaultKind, find_faults, mended
-from ident.data.dataset import differentiate
+from ident.data.channel_faults import ChannelFault, ChannelKind, FaultKind, find_faults, mended
+from ident.data.dataset import Dataset, differentiate
 from ident.data.run import Run
 from ident.errors import ReadingsDamaged
 from ident.estimators.diagnosis import diagnose
@@ -24,8 +24,12 @@ from tests.ident.mistaken import AXES, SMALL, small_recordings
 from tests.ident.recordings import three_axes_truth
 
 FloatArray = NDArray[np.float64]
+Change = Callable[[FloatArray], None]
+"""What changes a channel in place, shape (k,)."""
+
 RATE_HZ = 1000.0
-TIME_S = np.arange(6000) / RATE_HZ
+SAMPLES = 6000
+TIME_S = np.arange(SAMPLES) / RATE_HZ
 COUNT_RAD = 2.0 * np.pi / 65536
 NOISE_A = 0.05
 COUPLED = np.array([[30.0, 0.0], [-20.0, 25.0]])
@@ -37,13 +41,17 @@ def motion(seed: int = 0) -> FloatArray:
     2).
     """
     rng = np.random.default_rng(seed)
-    interpolated_time_s = np.interp(TIME_S, [0.3, 0.8, 4.7, 5.2], [0.0, 1.0, 1.0, 0.0])
-    pace = np.clip(interpolated_time_s, 0.0, 1.0)
-    passed_s = np.cumsum(pace) / RATE_HZ
-    angle = np.zeros((len(TIME_S), 2))
-    for speed in rng.uniform(0.3, 1.5, (3, 2)):
-        angle += 20.0 * np.sin(2.0 * np.pi * speed * passed_s[:, None]) / (1.0 + speed)
-    return np.asarray(np.round(angle / COUNT_RAD) * COUNT_RAD)
+    pace = np.interp(TIME_S, [0.3, 0.8, 4.7, 5.2], [0.0, 1.0, 1.0, 0.0])
+    passed_s = np.cumsum(pace)[:, None] / RATE_HZ
+    angle_rad = np.zeros((SAMPLES, 2))
+    for frequency_hz in rng.uniform(0.3, 1.5, (3, 2)):
+        amplitude_rad = 20.0 / (1.0 + frequency_hz)
+        angle_rad += amplitude_rad * np.sin(2.0 * np.pi * frequency_hz * passed_s)
+    return rounded(angle_rad, COUNT_RAD)
+
+
+def rounded(values: FloatArray, step: float) -> FloatArray:
+    return np.asarray(np.round(values / step) * step)
 
 
 def currents(position: FloatArray, seed: int = 0) -> FloatArray:
@@ -51,25 +59,54 @@ def currents(position: FloatArray, seed: int = 0) -> FloatArray:
     rng = np.random.default_rng(seed)
     noise = rng.normal(scale=NOISE_A, size=position.shape)
     velocity = np.gradient(position, 1.0 / RATE_HZ, axis=0)
-    return np.asarray(
-        0.8 * np.tanh(velocity) + 0.004 * velocity + 0.6 * np.cos(position / 30.0) + noise
-    )
+    friction = 0.8 * np.tanh(velocity) + 0.004 * velocity
+    gravity = 0.6 * np.cos(position / 30.0)
+    return np.asarray(friction + gravity + noise)
 
 
-def planted(
-    change: Callable[[FloatArray], None], *, in_current: bool = False, seed: int = 0
-) -> tuple[FloatArray, FloatArray]:
-    """Positions and currents of which one column was changed in place."""
+def sound(seed: int = 0) -> tuple[FloatArray, FloatArray]:
+    """Positions and currents without a fault."""
     position = motion(seed)
-    current = currents(position, seed)
-    change(current[:, 1] if in_current else position[:, 1])
+    return position, currents(position, seed)
+
+
+def damaged_position(change: Change, seed: int = 0) -> tuple[FloatArray, FloatArray]:
+    """Positions and currents, the position of the second axis changed."""
+    position, current = sound(seed)
+    change(position[:, 1])
     return position, current
 
 
-def kinds(position: FloatArray, current: FloatArray) -> list[tuple[FaultKind, ChannelKind, int]]:
-    """What is found, without where."""
-    faults = find_faults(position, current, RATE_HZ)
-    return [(one.kind, one.quantity, one.axis) for one in faults]
+def damaged_current(change: Change, seed: int = 0) -> tuple[FloatArray, FloatArray]:
+    """Positions and currents, the current of the second axis changed."""
+    position, current = sound(seed)
+    change(current[:, 1])
+    return position, current
+
+
+def frozen(first: int, end: int | None = None) -> Change:
+    """The change that holds a sample up to another one, or to the last one."""
+
+    def change(channel: FloatArray) -> None:
+        channel[first:end] = channel[first]
+
+    return change
+
+
+def zeroed(first: int, end: int) -> Change:
+    def change(channel: FloatArray) -> None:
+        channel[first:end] = 0.0
+
+    return change
+
+
+def held(channel: FloatArray) -> FloatArray:
+    """The channel with each tenth reading held for 10 ms."""
+    return channel[np.arange(SAMPLES) // 10 * 10]
+
+
+def place_of(fault: ChannelFault) -> tuple[FaultKind, ChannelKind, int]:
+    return fault.kind, fault.quantity, fault.axis
 
 
 # Sound recordings
@@ -78,26 +115,50 @@ def kinds(position: FloatArray, current: FloatArray) -> list[tuple[FaultKind, Ch
 @given(seed=st.integers(0, 999))
 @settings(max_examples=20, deadline=None)
 def test_a_sound_recording_has_no_fault(seed: int) -> None:
-    position, current = planted(lambda _: None, seed=seed)
+    position, current = sound(seed)
     assert find_faults(position, current, RATE_HZ) == ()
 
 
+def flickering() -> FloatArray:
+    flickers = np.arange(SAMPLES) % 977 == 0
+    return np.where(flickers, 0.3 + COUNT_RAD, 0.3)
+
+
+def moving_at_the_end() -> FloatArray:
+    moving_s = np.maximum(TIME_S - 5.7, 0.0)
+    return 1.0 - np.cos(10.0 * moving_s)
+
+
+def constant_acceleration() -> FloatArray:
+    acceleration = np.sign(np.sin(4.0 * TIME_S))
+    velocity = np.cumsum(acceleration)
+    return np.cumsum(velocity) * 1e-6
+
+
+def noise() -> FloatArray:
+    rng = np.random.default_rng(1)
+    return np.sin(TIME_S) + rng.normal(scale=0.01, size=SAMPLES)
+
+
+def sudden_stops() -> FloatArray:
+    times_s = [0.0, 2.0, 2.02, 3.0, 3.02, 6.0]
+    positions = [0.0, 2.0, 2.01, 2.01, 2.02, 5.0]
+    return np.interp(TIME_S, times_s, positions)
+
+
 SOUND: dict[str, Callable[[], FloatArray]] = {
-    "at rest": lambda: np.full(6000, 0.3),
-    "at rest with an encoder that flickers": lambda: 0.3 + COUNT_RAD * (np.arange(6000) % 977 == 0),
-    "at rest for most of the run": lambda: np.where(
-        TIME_S < 5.7, 0.0, 1.0 - np.cos(10.0 * (TIME_S - 5.7))
-    ),
-    "really slow": lambda: np.round(0.001 * TIME_S / COUNT_RAD) * COUNT_RAD,
-    "coarse encoder": lambda: np.round(np.sin(TIME_S) / 0.02) * 0.02,
+    "at rest": lambda: np.full(SAMPLES, 0.3),
+    "at rest with an encoder that flickers": flickering,
+    "at rest for most of the run": moving_at_the_end,
+    "really slow": lambda: rounded(0.001 * TIME_S, COUNT_RAD),
+    "coarse encoder": lambda: rounded(np.sin(TIME_S), 0.02),
     "sharp corners": lambda: np.abs(np.mod(TIME_S, 2.0) - 1.0),
-    "constant acceleration": lambda: np.cumsum(np.cumsum(np.sign(np.sin(4.0 * TIME_S)))) * 1e-6,
-    "noise": lambda: np.sin(TIME_S) + np.random.default_rng(1).normal(scale=0.01, size=6000),
-    "readings held for 10 ms": lambda: np.sin(2.0 * TIME_S)[np.arange(6000) // 10 * 10],
-    "stops within 20 ms": lambda: np.interp(
-        TIME_S, [0.0, 2.0, 2.02, 3.0, 3.02, 6.0], [0.0, 2.0, 2.01, 2.01, 2.02, 5.0]
-    ),
+    "constant acceleration": constant_acceleration,
+    "noise": noise,
+    "readings held for 10 ms": lambda: held(np.sin(2.0 * TIME_S)),
+    "stops within 20 ms": sudden_stops,
 }
+"""Positions of the second axis that look odd."""
 
 
 @pytest.mark.parametrize("kind", SOUND)
@@ -123,48 +184,57 @@ def test_what_only_looks_odd_is_no_fault(kind: str) -> None:
 def test_a_glitch_is_found_where_it_is_and_filled_in(
     start: int, samples: int, size: float, is_down: bool, seed: int
 ) -> None:
-    def change(channel: FloatArray) -> None:
-        channel[start : start + samples] += -size if is_down else size
+    step = -size if is_down else size
 
-    position, current = planted(change, seed=seed)
+    def change(channel: FloatArray) -> None:
+        channel[start : start + samples] += step
+
+    position, current = damaged_position(change, seed)
     (found,) = find_faults(position, current, RATE_HZ)
-    expected = (FaultKind.GLITCH, ChannelKind.POSITION, 1)
-    assert (found.kind, found.quantity, found.axis) == expected
+    assert place_of(found) == (FaultKind.GLITCH, ChannelKind.POSITION, 1)
     assert found.stretches.tolist() == [[start, start + samples]]
     assert found.size == pytest.approx(size, rel=0.3, abs=0.05)
     assert not found.is_refused
-    sound = motion(seed)
-    inside = 10 < start < 5980
-    difference = np.abs(mended(position, (found,), RATE_HZ) - sound)
-    assert difference.max() < (3.0 * COUNT_RAD if inside else 0.05)
+    error_rad = np.abs(mended(position, (found,), RATE_HZ) - motion(seed))
+    is_at_an_end = not 10 < start < 5980
+    limit_rad = 0.05 if is_at_an_end else 3.0 * COUNT_RAD
+    assert error_rad.max() < limit_rad
 
 
-@pytest.mark.parametrize("samples", [1, 3, 20, 50])
-def test_a_dropout_to_zero_is_filled_in(samples: int) -> None:
-    zeros = slice(2000, 2000 + samples)
-    for in_current in (False, True):
-        position, current = planted(
-            lambda channel: np.copyto(channel[zeros], 0.0), in_current=in_current, seed=1
-        )
-        if in_current:
-            current += 4.0
-            current[zeros, 1] = 0.0
-        (found,) = find_faults(position, current, RATE_HZ)
-        assert found.kind is FaultKind.GLITCH
-        expected = [[2000, 2000 + samples]]
-        assert found.stretches.tolist() == expected
-    sound = currents(motion(1), 1) + 4.0
+DROPOUT_LENGTHS = (1, 3, 20, 50)  #: samples
+
+
+@pytest.mark.parametrize("samples", DROPOUT_LENGTHS)
+def test_a_dropout_of_a_position_to_zero_is_a_glitch(samples: int) -> None:
+    first = 2000
+    end = first + samples
+    position, current = damaged_position(zeroed(first, end), seed=1)
+    (found,) = find_faults(position, current, RATE_HZ)
+    assert found.kind is FaultKind.GLITCH
+    assert found.stretches.tolist() == [[first, end]]
+
+
+@pytest.mark.parametrize("samples", DROPOUT_LENGTHS)
+def test_a_dropout_of_a_current_to_zero_is_filled_in(samples: int) -> None:
+    first = 2000
+    end = first + samples
+    position, sound_current = sound(seed=1)
+    sound_current += 4.0  # far from zero
+    current = sound_current.copy()
+    current[first:end, 1] = 0.0
+    (found,) = find_faults(position, current, RATE_HZ)
+    assert found.kind is FaultKind.GLITCH
+    assert found.stretches.tolist() == [[first, end]]
     filled = mended(current, (found,), RATE_HZ, quantity=ChannelKind.CURRENT)
-    filled_difference = np.abs(filled - sound)
-    largest_filled_difference = filled_difference[zeros].max()
-    assert largest_filled_difference < 8.0 * NOISE_A
+    error_a = np.abs(filled - sound_current)
+    assert error_a[first:end].max() < 8.0 * NOISE_A
 
 
 def test_a_current_where_a_joint_breaks_loose_is_no_glitch() -> None:
     """As on a real robot at 250 Hz: for a sample the controller asks for three times the current,
     which rings on.
     """
-    position, current = planted(lambda _: None)
+    position, current = sound()
     current[2000:2005, 1] += [-1.4, -0.2, 0.5, 0.5, 0.4]
     assert find_faults(position, current, RATE_HZ) == ()
 
@@ -172,7 +242,7 @@ def test_a_current_where_a_joint_breaks_loose_is_no_glitch() -> None:
 @pytest.mark.parametrize("sample", [1, 5998])
 def test_a_current_that_steps_beside_an_end_of_the_recording_is_no_glitch(sample: int) -> None:
     """Friction turned there: nothing says that the current would return."""
-    position, current = planted(lambda _: None)
+    position, current = sound()
     if sample == 1:
         current[:sample, 1] -= 5.0
     else:
@@ -184,9 +254,10 @@ def test_glitches_in_too_many_samples_are_refused() -> None:
     def change(channel: FloatArray) -> None:
         channel[100:5000:40] += 3.0
 
-    position, current = planted(change)
+    position, current = damaged_position(change)
     (found,) = find_faults(position, current, RATE_HZ)
-    assert (found.kind, len(found.stretches)) == (FaultKind.GLITCH, 123)
+    assert found.kind is FaultKind.GLITCH
+    assert len(found.stretches) == 123
     assert found.is_refused
 
 
@@ -194,38 +265,40 @@ def test_a_glitch_of_held_readings_is_a_reading() -> None:
     """Each reading stays for 10 ms, the glitch too."""
 
     def change(channel: FloatArray) -> None:
-        channel[:] = channel[np.arange(6000) // 10 * 10]
+        channel[:] = held(channel)
         channel[1500:1510] += 30.0
 
-    position, current = planted(change)
+    position, current = damaged_position(change)
     (found,) = find_faults(position, current, RATE_HZ)
-    expected = (FaultKind.GLITCH, [[1500, 1510]])
-    assert (found.kind, found.stretches.tolist()) == expected
+    assert found.kind is FaultKind.GLITCH
+    assert found.stretches.tolist() == [[1500, 1510]]
+
+
+def joints_of_coupled_motors(motor_rad: FloatArray) -> FloatArray:
+    return np.asarray(motor_rad @ np.linalg.inv(COUPLED).T)
 
 
 def test_a_glitch_of_a_coupled_motor_is_that_of_its_own_axis() -> None:
-    motor_rad = motion()
+    motor_rad, current = sound()
+    sound_joint_rad = joints_of_coupled_motors(motor_rad)
     motor_rad[1500, 0] += 1.0
-    coupled_inverse = np.linalg.inv(COUPLED)
-    joint_rad = motor_rad @ coupled_inverse.T
-    current = currents(motion())
+    joint_rad = joints_of_coupled_motors(motor_rad)
     (found,) = find_faults(joint_rad, current, RATE_HZ, COUPLED)
     assert (found.kind, found.axis) == (FaultKind.GLITCH, 0)
-    sound = motion() @ np.linalg.inv(COUPLED).T
-    assert mended(joint_rad, (found,), RATE_HZ, COUPLED) == pytest.approx(sound, abs=1e-5)
+    filled = mended(joint_rad, (found,), RATE_HZ, COUPLED)
+    assert filled == pytest.approx(sound_joint_rad, abs=1e-5)
 
 
 def test_a_frozen_encoder_of_a_coupled_joint_is_found() -> None:
-    joint_rad = motion() @ np.linalg.inv(COUPLED).T
+    motor_rad, current = sound()
+    joint_rad = joints_of_coupled_motors(motor_rad)
     joint_rad[1500:1800, 1] = joint_rad[1500, 1]
-    current = currents(motion())
-    found = find_faults(joint_rad, current, RATE_HZ, COUPLED)
-    expected = [(FaultKind.FROZEN, 1)]
-    assert [(one.kind, one.axis) for one in found] == expected
+    (found,) = find_faults(joint_rad, current, RATE_HZ, COUPLED)
+    assert (found.kind, found.axis) == (FaultKind.FROZEN, 1)
 
 
 def test_what_is_known_to_be_missing_is_no_finding() -> None:
-    position, current = planted(lambda channel: np.copyto(channel[1500:1540], 0.0))
+    position, current = damaged_position(zeroed(1500, 1540))
     usable = np.ones(position.shape, dtype=np.bool_)
     usable[1500:1540, 1] = False
     faults = find_faults(position, current, RATE_HZ, usable=usable)
@@ -238,32 +311,33 @@ def test_what_is_known_to_be_missing_is_no_finding() -> None:
 @pytest.mark.parametrize("bits", [12, 14, 16])
 @pytest.mark.parametrize("signed", [True, False])
 def test_a_counter_that_wraps_is_refused_with_its_bits(bits: int, signed: bool) -> None:
-    whole = 2.0**bits * COUNT_RAD
-    least = -0.5 * whole if signed else 0.0
+    range_rad = 2.0**bits * COUNT_RAD
+    least_rad = -0.5 * range_rad if signed else 0.0
 
     def change(channel: FloatArray) -> None:
-        channel[:] = np.mod(channel - least, whole) + least
+        channel[:] = np.mod(channel - least_rad, range_rad) + least_rad
 
-    position, current = planted(change)
+    position, current = damaged_position(change)
     (found,) = find_faults(position, current, RATE_HZ)
     assert (found.kind, found.axis) == (FaultKind.WRAPPING, 1)
-    assert found.size == pytest.approx(whole, rel=0.01)
+    assert found.size == pytest.approx(range_rad, rel=0.01)
     assert found.is_refused
 
 
 def test_negative_currents_without_their_sign_are_refused() -> None:
-    whole = 2.0**16 * 0.001
+    digit_a = 0.001
+    range_a = 2.0**16 * digit_a
 
     def change(channel: FloatArray) -> None:
-        channel[:] = np.mod(np.round(channel / 0.001) * 0.001, whole)
+        channel[:] = np.mod(rounded(channel, digit_a), range_a)
 
-    assert kinds(*planted(change, in_current=True)) == [
-        (FaultKind.UNSIGNED, ChannelKind.CURRENT, 1)
-    ]
+    position, current = damaged_current(change)
+    (found,) = find_faults(position, current, RATE_HZ)
+    assert place_of(found) == (FaultKind.UNSIGNED, ChannelKind.CURRENT, 1)
 
 
 def test_a_current_that_friction_turns_between_two_values_has_its_sign() -> None:
-    position, current = planted(lambda _: None)
+    position, current = sound()
     current[:, 1] = np.where(np.sin(3.0 * TIME_S) > 0.0, 5.0, -5.0)
     assert find_faults(position, current, RATE_HZ) == ()
 
@@ -272,64 +346,65 @@ def test_an_encoder_that_lost_its_place_is_refused() -> None:
     def change(channel: FloatArray) -> None:
         channel[1500:] += 2.0
 
-    assert kinds(*planted(change)) == [(FaultKind.DISPLACED, ChannelKind.POSITION, 1)]
+    position, current = damaged_position(change)
+    (found,) = find_faults(position, current, RATE_HZ)
+    assert place_of(found) == (FaultKind.DISPLACED, ChannelKind.POSITION, 1)
 
 
 # Frozen and clipped
+
+FILTER_REACH = 101
+"""Samples beside a gap that the filters may spoil."""
+
+
+def differentiated(position: FloatArray, current: FloatArray) -> Dataset:
+    run = Run("r", TIME_S, position, current)
+    conditioning = replace(SMALL, standstill_rad_s=(0.1, 0.1))
+    return differentiate(run, DriveTrain(np.eye(2)), conditioning)
 
 
 @pytest.mark.parametrize("seconds", [0.1, 0.3])
 def test_a_frozen_position_is_left_out_on_every_axis(seconds: float) -> None:
     end = 1500 + round(seconds * RATE_HZ)
-    position, current = planted(lambda channel: np.copyto(channel[1500:end], channel[1500]))
+    position, current = damaged_position(frozen(1500, end))
     (found,) = find_faults(position, current, RATE_HZ)
-    expected = (FaultKind.FROZEN, ChannelKind.POSITION, 1)
-    assert (found.kind, found.quantity, found.axis) == expected
+    assert place_of(found) == (FaultKind.FROZEN, ChannelKind.POSITION, 1)
     assert found.stretches.tolist() == [[1500, end]]
-    run = Run("r", TIME_S, position, current)
-    drive_train = DriveTrain(np.eye(2))
-    data = differentiate(run, drive_train, SMALL_TWO)
+    data = differentiated(position, current)
     assert not data.valid[1499:end].any()
-    assert data.valid[: 1499 - 101].all()
-    assert data.valid[end + 101 :].all()
+    assert data.valid[: 1499 - FILTER_REACH].all()
+    assert data.valid[end + FILTER_REACH :].all()
 
 
 @pytest.mark.parametrize("begin_s", [2.0, 3.1, 4.0])
 def test_a_position_that_freezes_to_the_end_is_found(begin_s: float) -> None:
     begin = round(begin_s * RATE_HZ)
-    position, current = planted(lambda channel: np.copyto(channel[begin:], channel[begin]))
+    position, current = damaged_position(frozen(begin))
     (found,) = find_faults(position, current, RATE_HZ)
-    expected = (FaultKind.FROZEN, ChannelKind.POSITION, 1)
-    assert (found.kind, found.quantity, found.axis) == expected
+    assert place_of(found) == (FaultKind.FROZEN, ChannelKind.POSITION, 1)
     assert found.stretches.tolist() == [[begin, len(position)]]
 
 
 def test_a_robot_that_is_stopped_at_once_is_not_frozen() -> None:
-    position, _ = planted(lambda _: None)
+    position, _ = sound()
     position[3300:] = position[3300]
     faults = find_faults(position, currents(position), RATE_HZ)
     assert faults == ()
 
 
 def test_an_axis_without_acceleration_that_is_done_before_the_others_is_not_frozen() -> None:
-    position, _ = planted(lambda _: None)
-    position[:, 1] = np.interp(
-        TIME_S, [0.0, 1.0, 1.6, 2.0, 2.4, 3.0], [0.0, 5.0, 2.0, 9.0, 1.0, 6.0]
-    )
+    position, _ = sound()
+    times_s = [0.0, 1.0, 1.6, 2.0, 2.4, 3.0]
+    position[:, 1] = np.interp(TIME_S, times_s, [0.0, 5.0, 2.0, 9.0, 1.0, 6.0])
     faults = find_faults(position, currents(position), RATE_HZ)
     assert faults == ()
 
 
 def test_a_frozen_current_is_left_out_on_its_axis() -> None:
-    position, current = planted(
-        lambda channel: np.copyto(channel[1500:1800], channel[1500]), in_current=True
-    )
+    position, current = damaged_current(frozen(1500, 1800))
     (found,) = find_faults(position, current, RATE_HZ)
-    expected = (FaultKind.FROZEN, ChannelKind.CURRENT, 1)
-    assert (found.kind, found.quantity, found.axis) == expected
-    run = Run("r", TIME_S, position, current)
-    drive_train = DriveTrain(np.eye(2))
-    data = differentiate(run, drive_train, SMALL_TWO)
+    assert place_of(found) == (FaultKind.FROZEN, ChannelKind.CURRENT, 1)
+    data = differentiated(position, current)
     assert not data.valid[1499:1799, 1].any()
     assert data.valid[:, 0].all()
 
@@ -337,10 +412,10 @@ def test_a_frozen_current_is_left_out_on_its_axis() -> None:
 @pytest.mark.parametrize("percentile", [96.0, 80.0])
 def test_a_position_at_the_end_of_its_range_is_left_out(percentile: float) -> None:
     def change(channel: FloatArray) -> None:
-        channel_percentile = np.percentile(channel, percentile)
-        np.minimum(channel, channel_percentile, out=channel)
+        end_of_range = np.percentile(channel, percentile)
+        channel[:] = np.minimum(channel, end_of_range)
 
-    position, current = planted(change, seed=1)
+    position, current = damaged_position(change, seed=1)
     (found,) = find_faults(position, current, RATE_HZ)
     assert (found.kind, found.axis) == (FaultKind.CLIPPED, 1)
     assert found.is_left_out
@@ -352,43 +427,41 @@ def test_an_axis_that_stops_and_goes_on_without_acceleration_is_not_frozen() -> 
     """As of a simple device, or of a robot that ran into something;
     it goes on from where it stood.
     """
-    position, _ = planted(lambda _: None)
-    position[:, 1] = np.interp(
-        TIME_S, [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0], [0.0, 5.0, 5.0, 2.0, 2.0, 9.0, 12.0]
-    )
+    position, _ = sound()
+    times_s = [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0]
+    position[:, 1] = np.interp(TIME_S, times_s, [0.0, 5.0, 5.0, 2.0, 2.0, 9.0, 12.0])
     faults = find_faults(position, currents(position), RATE_HZ)
     assert faults == ()
-
-
-SMALL_TWO = replace(SMALL, standstill_rad_s=(0.1, 0.1))
 
 
 # In a fit
 
 
-def with_position(run: Run, change: Callable[[FloatArray], None]) -> Run:
-    """The run with another position of J2."""
-    position = run.position_rad.copy()
+def with_last_position(runs: Sequence[Run], change: Change) -> list[Run]:
+    """The runs, the last one with another position of J2."""
+    *others, last = runs
+    position = last.position_rad.copy()
     change(position[:, 1])
-    return replace(run, position_rad=position)
+    return [*others, replace(last, position_rad=position)]
 
 
 def test_a_fit_names_a_glitch_and_has_the_gains_of_the_sound_run() -> None:
     runs = small_recordings(TRUTH, 0)
-    sound = identify(TRUTH.model, runs, SMALL, axes=AXES)
+    expected = identify(TRUTH.model, runs, SMALL, axes=AXES)
 
     def change(channel: FloatArray) -> None:
         channel[3000] += 1.0
 
-    damaged = [*runs[:3], with_position(runs[3], change)]
+    damaged = with_last_position(runs, change)
     found = identify(TRUTH.model, damaged, SMALL, axes=AXES)
-    assert found.estimate.gains == pytest.approx(sound.estimate.gains, rel=1e-4)
-    (said,) = [one for one in diagnose(found, AXES, TRUTH.gains) if one.name == "readings-damaged"]
-    at_s = 3000 / runs[3].rate_hz
-    expected = (("r3",), ("J2",))
-    assert (said.runs, said.axes) == expected
-    assert f"at {at_s:g} s" in said.found
-    assert said.found.endswith("these samples were filled in")
+    assert found.estimate.gains == pytest.approx(expected.estimate.gains, rel=1e-4)
+    diagnoses = diagnose(found, AXES, TRUTH.gains)
+    (diagnosis,) = (one for one in diagnoses if one.name == "readings-damaged")
+    glitch_s = 3000 / runs[3].rate_hz
+    assert diagnosis.runs == ("r3",)
+    assert diagnosis.axes == ("J2",)
+    assert f"at {glitch_s:g} s" in diagnosis.found
+    assert diagnosis.found.endswith("these samples were filled in")
 
 
 def test_a_fit_refuses_an_encoder_that_lost_its_place() -> None:
@@ -397,10 +470,7 @@ def test_a_fit_refuses_an_encoder_that_lost_its_place() -> None:
     def change(channel: FloatArray) -> None:
         channel[3000:] += 1.0
 
-    damaged = [*runs[:3], with_position(runs[3], change)]
-    with pytest.raises(
-        ReadingsDamaged,
-        match=r"run 'r3': axis J2: found a position that steps by "
-        r"50 rad of the motor",
-    ):
+    damaged = with_last_position(runs, change)
+    message = "run 'r3': axis J2: found a position that steps by 50 rad of the motor"
+    with pytest.raises(ReadingsDamaged, match=message):
         identify(TRUTH.model, damaged, SMALL, axes=AXES)

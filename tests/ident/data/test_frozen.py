@@ -22,9 +22,12 @@ from ident.data.glitches import Readings
 FloatArray = NDArray[np.float64]
 RATE_HZ = 1000.0
 COUNT = 0.01
-STEP = 2.0
+STEP = 2.0  #: of a position in a sample
 SAMPLES = 2000
-BEGIN = 700
+BEGIN = 700  #: first sample of a stretch
+
+Stretches = list[list[int]]
+NONE: Stretches = []
 
 
 def _readings(values: FloatArray, every: int = 1, count: float = COUNT) -> Readings:
@@ -33,65 +36,77 @@ def _readings(values: FloatArray, every: int = 1, count: float = COUNT) -> Readi
     return Readings(values=values, sample=sample, rate_hz=RATE_HZ, count=count)
 
 
-def _way(seconds: float = SAMPLES / RATE_HZ) -> FloatArray:
-    return STEP * np.arange(round(seconds * RATE_HZ), dtype=np.float64)
+def _listed(stretches: NDArray[np.intp]) -> Stretches:
+    assert stretches.shape == (len(stretches), 2)
+    listed: Stretches = stretches.tolist()
+    return listed
+
+
+def _found_in_position(values: FloatArray, every: int = 1) -> Stretches:
+    return _listed(frozen_position(_readings(values, every)))
+
+
+def _way() -> FloatArray:
+    """A position at one speed."""
+    return STEP * np.arange(SAMPLES, dtype=np.float64)
 
 
 def _frozen_way(samples: int, jump: float) -> FloatArray:
     """A way at one speed that stands for so many samples, and goes on with a jump."""
     values = _way()
     values[BEGIN : BEGIN + samples] = values[BEGIN]
-    values[BEGIN + samples :] += values[BEGIN] + jump - values[BEGIN + samples]
+    end = BEGIN + samples
+    values[end:] += values[BEGIN] + jump - values[end]
     return values
 
 
-@pytest.mark.parametrize(("samples", "found"), [(50, []), (51, [[BEGIN, BEGIN + 51]])])
+@pytest.mark.parametrize(("samples", "found"), [(50, NONE), (51, [[BEGIN, BEGIN + 51]])])
 def test_a_position_is_frozen_beyond_50_ms(samples: int, found: list[list[int]]) -> None:
-    stretches = frozen_position(_readings(_frozen_way(samples, float(samples))))
-    assert stretches.tolist() == found
+    values = _frozen_way(samples, jump=float(samples))
+    assert _found_in_position(values) == found
 
 
 @pytest.mark.parametrize(("jump", "is_frozen"), [(6.0, False), (6.09, False), (6.11, True)])
 def test_a_frozen_position_jumps_by_three_usual_steps_and_ten_counts(
     jump: float, is_frozen: bool
 ) -> None:
-    stretches = frozen_position(_readings(_frozen_way(80, jump)))
-    assert stretches.tolist() == ([[BEGIN, BEGIN + 80]] if is_frozen else [])
+    expected = [[BEGIN, BEGIN + 80]] if is_frozen else NONE
+    assert _found_in_position(_frozen_way(80, jump)) == expected
 
 
 def test_a_frozen_position_may_jump_back() -> None:
-    stretches = frozen_position(_readings(_frozen_way(80, -6.2)))
-    assert stretches.tolist() == [[BEGIN, BEGIN + 80]]
+    values = _frozen_way(80, jump=-6.2)
+    assert _found_in_position(values) == [[BEGIN, BEGIN + 80]]
 
 
 def test_a_position_that_is_frozen_from_the_start_is_found() -> None:
     values = _way()
     values[:80] = values[79]
     values[80:] += 20.0
-    assert frozen_position(_readings(values)).tolist() == [[0, 80]]
+    assert _found_in_position(values) == [[0, 80]]
 
 
 def test_a_position_that_does_not_go_on_has_no_jump() -> None:
     values = _way()
     values[BEGIN:] = values[BEGIN]
-    assert frozen_position(_readings(values)).shape == (0, 2)
+    assert _found_in_position(values) == NONE
 
 
 def test_a_frozen_position_may_differ_by_rounding() -> None:
-    values = _frozen_way(80, 80.0)
+    values = _frozen_way(80, jump=80.0)
     values[BEGIN + 1 : BEGIN + 80 : 2] += 1e-9
-    assert frozen_position(_readings(values)).tolist() == [[BEGIN, BEGIN + 80]]
+    assert _found_in_position(values) == [[BEGIN, BEGIN + 80]]
 
 
 def test_a_stretch_is_given_in_samples_where_readings_are_held() -> None:
-    stretches = frozen_position(_readings(_frozen_way(80, 80.0), every=3))
+    stretches = _found_in_position(_frozen_way(80, jump=80.0), every=3)
     # The last reading of the stretch is not known to have been there any longer than itself.
-    assert stretches.tolist() == [[3 * BEGIN, 3 * (BEGIN + 79) + 1]]
+    assert stretches == [[3 * BEGIN, 3 * (BEGIN + 79) + 1]]
 
 
 @pytest.mark.parametrize("values", [np.zeros(0), np.zeros(1), np.full(500, 0.3)])
 def test_a_position_that_never_moves_is_not_frozen(values: FloatArray) -> None:
-    assert frozen_position(_readings(values)).shape == (0, 2)
+    assert _found_in_position(values) == NONE
 
 
 # A position that is frozen until the end
@@ -113,24 +128,31 @@ def _stopped(values: FloatArray) -> FloatArray:
 
 
 def _others() -> FloatArray:
+    """Another motor that goes on, shape (k, 1)."""
     return _swinging(0.7)[:, None]
 
 
+def _found_at_the_end(
+    values: FloatArray, others: FloatArray, every: int = 1, count: float = COUNT
+) -> Stretches:
+    return _listed(frozen_to_the_end(_readings(values, every, count), others))
+
+
 def test_a_position_that_stops_at_full_speed_while_others_move_is_frozen() -> None:
-    stretches = frozen_to_the_end(_readings(_stopped(_swinging())), _others())
-    assert stretches.tolist() == [[STOP, SAMPLES]]
+    values = _stopped(_swinging())
+    assert _found_at_the_end(values, _others()) == [[STOP, SAMPLES]]
 
 
 def test_a_position_that_stops_at_its_turn_is_not_frozen() -> None:
     values = _swinging()
     values[1250:] = values[1250]
-    assert frozen_to_the_end(_readings(values), _others()).shape == (0, 2)
+    assert _found_at_the_end(values, _others()) == NONE
 
 
 def test_a_position_that_goes_on_once_more_is_not_frozen_to_the_end() -> None:
     values = _stopped(_swinging())
     values[-1] += 5.0
-    assert frozen_to_the_end(_readings(values), _others()).shape == (0, 2)
+    assert _found_at_the_end(values, _others()) == NONE
 
 
 @pytest.mark.parametrize(("until", "is_frozen"), [(STOP + 480, False), (STOP + 560, True)])
@@ -139,8 +161,8 @@ def test_others_must_move_later_than_half_a_second_after_the_stop(
 ) -> None:
     others = _others()
     others[until:] = others[until]
-    stretches = frozen_to_the_end(_readings(_stopped(_swinging())), others)
-    assert bool(len(stretches)) is is_frozen
+    stretches = _found_at_the_end(_stopped(_swinging()), others)
+    assert bool(stretches) is is_frozen
 
 
 @pytest.mark.parametrize(("share", "is_frozen"), [(0.019, False), (0.021, True)])
@@ -148,8 +170,8 @@ def test_others_must_move_by_a_fiftieth_of_their_range(share: float, is_frozen: 
     others = _others()
     others[STOP:] = others[STOP]
     others[-100:] = others[STOP] + share * np.ptp(others)
-    stretches = frozen_to_the_end(_readings(_stopped(_swinging())), others)
-    assert bool(len(stretches)) is is_frozen
+    stretches = _found_at_the_end(_stopped(_swinging()), others)
+    assert bool(stretches) is is_frozen
 
 
 @pytest.mark.parametrize(("height", "is_frozen"), [(0.985, True), (0.99, False)])
@@ -159,33 +181,37 @@ def test_a_frozen_motor_stops_three_times_as_abruptly_as_it_turns(
     # In the 10 ms before a height of A sin φ it goes A (sin φ − sin(φ − 0.02 π)): 0.0128 A before
     # 0.985 A, and 0.0109 A before 0.99 A. At its turns that way changes by 0.0039 A in 10 ms.
     values = _swinging()
-    stop = 1000 + round(1000.0 * np.arcsin(height) / (2.0 * np.pi))
+    phase = np.arcsin(height)
+    stop = STOP + round(RATE_HZ * phase / (2.0 * np.pi))
     values[stop:] = values[stop]
-    stretches = frozen_to_the_end(_readings(values, count=1e-4), _others())
-    assert bool(len(stretches)) is is_frozen
+    stretches = _found_at_the_end(values, _others(), count=1e-4)
+    assert bool(stretches) is is_frozen
 
 
-def test_a_motor_of_a_coarse_encoder_stops_by_more_than_ten_counts() -> None:
-    for count, is_frozen in ((0.04, True), (0.06, False)):
-        # It stops from 0.63 in 10 ms; three times its largest other change is 0.12.
-        stretches = frozen_to_the_end(_readings(_stopped(_swinging()), count=count), _others())
-        assert bool(len(stretches)) is is_frozen
+@pytest.mark.parametrize(("count", "is_frozen"), [(0.04, True), (0.06, False)])
+def test_a_motor_of_a_coarse_encoder_stops_by_more_than_ten_counts(
+    count: float, is_frozen: bool
+) -> None:
+    # It stops from 0.63 in 10 ms; three times its largest other change is 0.12.
+    stretches = _found_at_the_end(_stopped(_swinging()), _others(), count=count)
+    assert bool(stretches) is is_frozen
 
 
 def test_a_frozen_end_is_given_in_samples_where_readings_are_held() -> None:
     others = np.repeat(_others(), 2, axis=0)
-    stretches = frozen_to_the_end(_readings(_stopped(_swinging()), every=2), others)
-    assert stretches.tolist() == [[2 * STOP, 2 * SAMPLES - 1]]
+    stretches = _found_at_the_end(_stopped(_swinging()), others, every=2)
+    assert stretches == [[2 * STOP, 2 * SAMPLES - 1]]
 
 
 def test_without_another_motor_nothing_shows_that_the_robot_goes_on() -> None:
     alone = np.zeros((SAMPLES, 0))
-    assert frozen_to_the_end(_readings(_stopped(_swinging())), alone).shape == (0, 2)
+    assert _found_at_the_end(_stopped(_swinging()), alone) == NONE
 
 
 def test_any_of_the_others_is_enough() -> None:
-    others = np.column_stack((np.zeros(SAMPLES), _others()))
-    stretches = frozen_to_the_end(_readings(_stopped(_swinging())), others)
+    still = np.zeros(SAMPLES)
+    others = np.column_stack((still, _others()))
+    stretches = _found_at_the_end(_stopped(_swinging()), others)
     assert len(stretches) == 1
 
 
@@ -194,31 +220,32 @@ def test_a_motor_that_has_turned_but_once_shows_not_how_gently_it_stops(
     period_s: float, is_frozen: bool
 ) -> None:
     # In the second before the stop: two turns with a period of 1 s, one with 1.6 s.
-    readings = _readings(_stopped(_swinging(period_s)))
-    assert bool(len(frozen_to_the_end(readings, _others()))) is is_frozen
+    stretches = _found_at_the_end(_stopped(_swinging(period_s)), _others())
+    assert bool(stretches) is is_frozen
 
 
 def test_a_motor_that_stops_so_abruptly_at_other_times_is_not_frozen() -> None:
     # It goes to and fro at one speed, and turns from one sample to the next.
     time_s = np.arange(SAMPLES) / RATE_HZ
     values = 10.0 * np.abs(np.mod(time_s, 0.8) / 0.4 - 1.0)
-    readings = _readings(_stopped(values))
-    assert frozen_to_the_end(readings, _others()).shape == (0, 2)
+    assert _found_at_the_end(_stopped(values), _others()) == NONE
 
 
 # A position at the end of its range
 
 
-def _clipped(lowest: float, highest: float) -> Readings:
-    return _readings(np.clip(_swinging(), lowest, highest))
+def _clipped(lowest: float, highest: float) -> FloatArray:
+    return np.clip(_swinging(), lowest, highest)
+
+
+def _found_at_a_limit(values: FloatArray, count: float = COUNT) -> Stretches:
+    return _listed(clipped_position(_readings(values, count=count)))
 
 
 def test_a_position_beyond_the_end_of_its_range_is_found() -> None:
     # sin⁻¹ 0.5 is a twelfth of the period, 84 samples: it is cut until five twelfths.
-    found = clipped_position(_clipped(-99.0, 5.0))
-    assert found.tolist() == [[84, 417], [1084, 1417]]
-    below = clipped_position(_clipped(-5.0, 99.0))
-    assert below.tolist() == [[584, 917], [1584, 1917]]
+    assert _found_at_a_limit(_clipped(-99.0, 5.0)) == [[84, 417], [1084, 1417]]
+    assert _found_at_a_limit(_clipped(-5.0, 99.0)) == [[584, 917], [1584, 1917]]
 
 
 @pytest.mark.parametrize(("count", "is_clipped"), [(0.038, True), (0.042, False)])
@@ -226,27 +253,26 @@ def test_a_clipped_position_stops_more_abruptly_than_it_turns_and_by_ten_counts(
     count: float, is_clipped: bool
 ) -> None:
     # 0.516 in 10 ms before and after; three times its largest usual change is 0.118.
-    values = np.clip(_swinging(), -99.0, 5.0)
-    stretches = clipped_position(_readings(values, count=count))
-    assert bool(len(stretches)) is is_clipped
+    stretches = _found_at_a_limit(_clipped(-99.0, 5.0), count)
+    assert bool(stretches) is is_clipped
 
 
 @pytest.mark.parametrize("is_reversed", [False, True])
 def test_a_clipped_position_is_abrupt_at_one_end_at_least(is_reversed: bool) -> None:
     # At 10 units/s to its limit, 0.3 s there, and off with 20 units/s².
+    limit = 3.0
     time_s = np.arange(1000) / RATE_HZ
     there = 10.0 * time_s[:301]
-    back = 3.0 - 10.0 * time_s**2
-    values = np.concatenate((there, np.full(299, 3.0), back, np.full(100, back[-1])))
+    rest = np.full(299, limit)
+    back = limit - 10.0 * time_s**2
+    end = np.full(100, back[-1])
+    # Where it stands at its other end, it stops as abruptly: that is cut off.
+    values = np.concatenate((there, rest, back, end))[:-140]
     expected = [[300, 601]]
     if is_reversed:
         values = values[::-1].copy()
         expected = [[len(values) - 601, len(values) - 300]]
-    # Where it stands at its other end, it stops as abruptly: that is cut off.
-    inside = values[:-140] if not is_reversed else values[140:]
-    if is_reversed:
-        expected = [[first - 140, end - 140] for first, end in expected]
-    assert clipped_position(_readings(inside, count=1e-4)).tolist() == expected
+    assert _found_at_a_limit(values, count=1e-4) == expected
 
 
 def test_a_recording_may_begin_and_end_beyond_the_range() -> None:
@@ -254,8 +280,7 @@ def test_a_recording_may_begin_and_end_beyond_the_range() -> None:
     time_s = np.arange(SAMPLES) / RATE_HZ
     values = np.clip(10.0 * np.cos(2.0 * np.pi * time_s), -99.0, 5.0)
     # cos⁻¹ 0.5 is a sixth of the period.
-    found = clipped_position(_readings(values))
-    assert found.tolist() == [[0, 167], [834, 1167], [1834, 2000]]
+    assert _found_at_a_limit(values) == [[0, 167], [834, 1167], [1834, 2000]]
 
 
 @pytest.mark.parametrize("is_reversed", [False, True])
@@ -265,17 +290,19 @@ def test_a_motor_that_rests_at_an_end_of_the_recording_is_not_clipped(is_reverse
     values = np.concatenate((np.zeros(300), 10.0 * time_s**2))
     if is_reversed:
         values = values[::-1].copy()
-    assert clipped_position(_readings(values)).shape == (0, 2)
+    assert _found_at_a_limit(values) == NONE
 
 
 def test_stops_at_two_places_are_no_end_of_a_range() -> None:
-    assert clipped_position(_clipped(-5.0, 5.0)).shape == (0, 2)
+    assert _found_at_a_limit(_clipped(-5.0, 5.0)) == NONE
 
 
 def test_a_motor_that_rests_at_the_end_of_its_way_is_not_clipped() -> None:
-    half = _swinging()[:250]
-    values = np.concatenate((half, np.full(300, 10.0), half[::-1], -half, -half[::-1], half))
-    assert clipped_position(_readings(values)).shape == (0, 2)
+    up = _swinging()[:250]  # a quarter of a period
+    rest = np.full(300, 10.0)
+    down = up[::-1]
+    values = np.concatenate((up, rest, down, -up, -down, up))
+    assert _found_at_a_limit(values) == NONE
 
 
 @pytest.mark.parametrize(
@@ -284,7 +311,8 @@ def test_a_motor_that_rests_at_the_end_of_its_way_is_not_clipped() -> None:
 )
 def test_stretches_are_at_a_limit_where_all_are_at_one(places: list[int], expected: bool) -> None:
     readings = _readings(np.array([-1.0, 0.0, 1.0, 0.0, 0.5, 1.0]), every=4)
-    stretches = np.array([[4 * place, 4 * place + 1] for place in places]).reshape(-1, 2)
+    first = 4 * np.array(places, dtype=np.int64)
+    stretches = np.column_stack((first, first + 1))
     assert at_limit(readings, stretches) is expected
 
 
@@ -295,16 +323,20 @@ def _noisy_current() -> FloatArray:
     return np.random.default_rng(3).normal(size=SAMPLES)
 
 
-def _frozen_current(samples: int, value: float = 0.25) -> Readings:
+def _frozen_for(samples: int, value: float = 0.25) -> FloatArray:
+    """A noisy current that has one value for so many samples."""
     current = _noisy_current()
     current[BEGIN : BEGIN + samples] = value
-    return _readings(current)
+    return current
 
 
-@pytest.mark.parametrize(("samples", "found"), [(100, []), (101, [[BEGIN, BEGIN + 101]])])
+def _found_in_current(current: FloatArray, motor: FloatArray) -> Stretches:
+    return _listed(frozen_current(_readings(current), motor))
+
+
+@pytest.mark.parametrize(("samples", "found"), [(100, NONE), (101, [[BEGIN, BEGIN + 101]])])
 def test_a_current_is_frozen_beyond_100_ms(samples: int, found: list[list[int]]) -> None:
-    stretches = frozen_current(_frozen_current(samples), _way())
-    assert stretches.tolist() == found
+    assert _found_in_current(_frozen_for(samples), _way()) == found
 
 
 @pytest.mark.parametrize(("share", "is_frozen"), [(0.019, False), (0.021, True)])
@@ -314,17 +346,16 @@ def test_a_current_is_frozen_where_its_motor_moves_by_a_fiftieth_of_its_range(
     motor = np.zeros(SAMPLES)
     motor[1500:] = 1.0
     motor[BEGIN + 100 : 1500] = share
-    stretches = frozen_current(_frozen_current(200), motor)
-    assert stretches.tolist() == ([[BEGIN, BEGIN + 200]] if is_frozen else [])
+    expected = [[BEGIN, BEGIN + 200]] if is_frozen else NONE
+    assert _found_in_current(_frozen_for(200), motor) == expected
 
 
-def test_a_motor_may_move_at_the_last_frozen_sample_alone() -> None:
+@pytest.mark.parametrize(("moves_at", "is_frozen"), [(BEGIN + 199, True), (BEGIN + 200, False)])
+def test_a_motor_may_move_at_the_last_frozen_sample_alone(moves_at: int, is_frozen: bool) -> None:
     motor = np.zeros(SAMPLES)
-    for moves_at, is_frozen in ((BEGIN + 199, True), (BEGIN + 200, False)):
-        motor[:] = 0.0
-        motor[moves_at:] = 1.0
-        stretches = frozen_current(_frozen_current(200), motor)
-        assert bool(len(stretches)) is is_frozen
+    motor[moves_at:] = 1.0
+    stretches = _found_in_current(_frozen_for(200), motor)
+    assert bool(stretches) is is_frozen
 
 
 @pytest.mark.parametrize(("run", "is_frozen"), [(3, True), (5, False)])
@@ -335,30 +366,33 @@ def test_a_current_is_noisy_where_a_quarter_of_its_changes_turn_back(
     place = np.mod(np.arange(SAMPLES), 2 * run)
     current = np.minimum(place, 2 * run - place).astype(np.float64)
     current[BEGIN : BEGIN + 200] = 1.5
-    stretches = frozen_current(_readings(current), _way())
-    assert bool(len(stretches)) is is_frozen
+    stretches = _found_in_current(current, _way())
+    assert bool(stretches) is is_frozen
 
 
 def test_without_any_motion_no_current_is_frozen() -> None:
-    assert frozen_current(_frozen_current(200), np.zeros(SAMPLES)).shape == (0, 2)
+    still = np.zeros(SAMPLES)
+    assert _found_in_current(_frozen_for(200), still) == NONE
 
 
 def test_a_current_at_its_largest_value_is_not_frozen_but_limited() -> None:
     for value in (9.0, -9.0):
-        assert frozen_current(_frozen_current(200, value), _way()).shape == (0, 2)
+        assert _found_in_current(_frozen_for(200, value), _way()) == NONE
 
 
-def test_a_current_that_is_often_constant_is_frozen_beyond_ten_such_times() -> None:
-    # Each number stays for 15 samples.
-    current = np.repeat(_noisy_current(), 15)[:SAMPLES]
-    for samples, is_frozen in ((149, False), (150, True)):
-        changed = current.copy()
-        changed[705 : 705 + samples] = 0.25
-        stretches = frozen_current(_readings(changed), _way())
-        assert bool(len(stretches)) is is_frozen
+@pytest.mark.parametrize(("samples", "is_frozen"), [(149, False), (150, True)])
+def test_a_current_that_is_often_constant_is_frozen_beyond_ten_such_times(
+    samples: int, is_frozen: bool
+) -> None:
+    every = 15  # samples that each number stays
+    current = np.repeat(_noisy_current(), every)[:SAMPLES]
+    begin = 47 * every
+    current[begin : begin + samples] = 0.25
+    stretches = _found_in_current(current, _way())
+    assert bool(stretches) is is_frozen
 
 
 def test_a_current_without_noise_may_be_constant() -> None:
     current = np.asarray(np.sin(_way() / 300.0))
     current[BEGIN : BEGIN + 200] = current[BEGIN]
-    assert frozen_current(_readings(current), _way()).shape == (0, 2)
+    assert _found_in_current(current, _way()) == NONE

@@ -4,7 +4,7 @@ without data there is no floor.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -29,64 +29,74 @@ one of six motors is outside by chance in 2600 runs.
 """
 
 
-def _resting(truth: Truth, runs: int = 3) -> tuple[Dataset, ...]:
-    """Noiseless runs whose current bends slowly while a motor rests,
-    as that of an integrator does.
+def _with_resting_currents(data: Dataset, rng: np.random.Generator) -> Dataset:
+    """The data, with a current that bends slowly while a motor rests, as that of an integrator
+    does.
     """
-    rng = np.random.default_rng(8)
-    made = []
-    for number in range(runs):
-        run = record(truth, f"run{number}", rng, seconds=22.0)
-        data = differentiate(run, truth.model.drive_train, CONDITIONING)
-        current = data.current_a.copy()
-        for motor, still in enumerate(~data.motor_moving.T):
-            for part in _parts(still):
-                difference = part.stop - part.start
-                t = np.linspace(-1.0, 1.0, difference)
-                current[part, motor] = rng.normal() + rng.normal() * t + 0.3 * rng.normal() * t**2
-        made.append(replace(data, current_a=current))
-    return tuple(made)
+    current_a = data.current_a.copy()
+    for motor, moving in enumerate(data.motor_moving.T):
+        for dwell in _dwells(~moving):
+            t = np.linspace(-1.0, 1.0, dwell.stop - dwell.start)
+            offset, slope, curvature = rng.normal(size=3)
+            current_a[dwell, motor] = offset + slope * t + 0.3 * curvature * t**2
+    return replace(data, current_a=current_a)
 
 
-def _parts(still: NDArray[np.bool_]) -> list[slice]:
-    edges = np.flatnonzero(np.diff(np.concatenate(([0], still.astype(np.int8), [0]))))
-    return [slice(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+def _dwells(still: NDArray[np.bool_]) -> list[slice]:
+    """Stretches without motion."""
+    padded = np.concatenate(([0], still.astype(np.int8), [0]))
+    edges = np.flatnonzero(np.diff(padded)).tolist()
+    return [slice(first, end) for first, end in zip(edges[::2], edges[1::2], strict=True)]
 
 
 def _noisy(runs: Sequence[Dataset], seed: int = 5) -> tuple[Dataset, ...]:
     rng = np.random.default_rng(seed)
-    current_a = runs[0].current_a
-    noise_a = NOISE_A[: current_a.shape[1]]
-    return tuple(
-        replace(
-            data, current_a=data.current_a + noise_a * rng.standard_normal(data.current_a.shape)
-        )
-        for data in runs
-    )
+    axes = runs[0].current_a.shape[1]
+
+    def with_noise(data: Dataset) -> Dataset:
+        noise_a = NOISE_A[:axes] * rng.standard_normal(data.current_a.shape)
+        return replace(data, current_a=data.current_a + noise_a)
+
+    return tuple(with_noise(data) for data in runs)
 
 
 @pytest.fixture(scope="module")
 def resting(truth: Truth) -> tuple[Dataset, ...]:
-    return _resting(truth)
+    """Three noiseless runs of six axes, with currents that bend at rest."""
+    rng = np.random.default_rng(8)
+    datasets = []
+    for number in range(3):
+        run = record(truth, f"run{number}", rng, seconds=22.0)
+        data = differentiate(run, truth.model.drive_train, CONDITIONING)
+        datasets.append(_with_resting_currents(data, rng))
+    return tuple(datasets)
+
+
+def _small_run(truth: Truth, number: int, bend: Callable[[FloatArray], FloatArray]) -> Dataset:
+    """A noiseless run of three axes, its moves the same in every one but for a bend."""
+    rng = np.random.default_rng(8)
+    run = record(truth, f"run{number}", rng, seconds=22.0, bend=bend)
+    return differentiate(run, truth.model.drive_train, SMALL)
+
+
+def _delayed(position: FloatArray, samples: float) -> FloatArray:
+    at = np.arange(len(position))
+    axes = [np.interp(at - samples, at, axis) for axis in position.T]
+    return np.stack(axes, axis=1)
 
 
 @pytest.fixture(scope="module")
 def repeated(small_truth: Truth) -> tuple[Dataset, ...]:
     """Three noiseless runs of the same moves, each 2.4 samples later than the one before."""
-
-    def run(number: int) -> Dataset:
-        def later(q: FloatArray) -> FloatArray:
-            at = np.arange(len(q))
-            return np.stack([np.interp(at - 2.4 * number, at, axis) for axis in q.T], axis=1)
-
-        rng = np.random.default_rng(8)
-        made = record(small_truth, f"run{number}", rng, seconds=22.0, bend=later)
-        return differentiate(made, small_truth.model.drive_train, SMALL)
-
-    return tuple(run(number) for number in range(3))
+    return (
+        _small_run(small_truth, 0, lambda position: _delayed(position, 0.0)),
+        _small_run(small_truth, 1, lambda position: _delayed(position, 2.4)),
+        _small_run(small_truth, 2, lambda position: _delayed(position, 4.8)),
+    )
 
 
 def _all(floors: tuple[MotorNoiseFloor | None, ...]) -> tuple[MotorNoiseFloor, ...]:
+    """The floors, one of every motor."""
     known = tuple(floor for floor in floors if floor is not None)
     assert len(known) == len(floors)
     return known
@@ -95,30 +105,50 @@ def _all(floors: tuple[MotorNoiseFloor | None, ...]) -> tuple[MotorNoiseFloor, .
 def _expected_a(data: Dataset) -> FloatArray:
     """σ of a filtered row of white noise."""
     taps = decimator(data.rate_hz, CONDITIONING.decimation_cutoff_hz).taps
-    tap_norm = np.linalg.norm(taps)
-    return np.asarray(NOISE_A[: data.current_a.shape[1]] * tap_norm)
+    axes = data.current_a.shape[1]
+    return np.asarray(NOISE_A[:axes] * np.linalg.norm(taps))
+
+
+def _is_within_its_error(floor: MotorNoiseFloor, expected_a: float) -> bool:
+    limit = DEVIATIONS * floor.std_percent / 100.0
+    return floor.noise_a == pytest.approx(expected_a, rel=limit)
+
+
+def _noise_a(floors: Sequence[MotorNoiseFloor]) -> list[float]:
+    return [floor.noise_a for floor in floors]
+
+
+def _assert_unbiased(
+    draws: Sequence[Sequence[MotorNoiseFloor]], expected_a: FloatArray, rel_of_std: float
+) -> None:
+    """Check that estimates scatter about the true noise, and by as much as they report.
+
+    Args:
+        draws: floors of each draw of the noise, one a motor.
+        expected_a: the true noise of each motor.
+        rel_of_std: how well the scatter is known.
+    """
+    noise_a = np.array([_noise_a(floors) for floors in draws])
+    relative = noise_a / expected_a
+    std_percent = [floor.std_percent for floor in draws[0]]
+    reported = np.mean(std_percent) / 100.0
+    std_of_mean = reported / np.sqrt(relative.size)
+    assert relative.mean() == pytest.approx(1.0, abs=3.0 * std_of_mean + 0.01)
+    assert relative.std() == pytest.approx(reported, rel=rel_of_std)
 
 
 def test_a_known_noise_comes_back(resting: tuple[Dataset, ...]) -> None:
     floors = _all(noise_floors(_noisy(resting), CONDITIONING))
-    for floor, expected in zip(floors, _expected_a(resting[0]), strict=True):
-        assert floor.noise_a == pytest.approx(expected, rel=DEVIATIONS * floor.std_percent / 100.0)
+    for floor, expected_a in zip(floors, _expected_a(resting[0]), strict=True):
+        assert _is_within_its_error(floor, expected_a)
         assert floor.std_percent < 20.0
 
 
 @pytest.mark.slow
 def test_the_estimates_scatter_as_they_say_and_are_not_biased(resting: tuple[Dataset, ...]) -> None:
-    drawn = [_all(noise_floors(_noisy(resting, seed), CONDITIONING)) for seed in range(20)]
-    noise_a = []
-    for floors in drawn:
-        noise_a.append([floor.noise_a for floor in floors])
-    relative = np.array(noise_a) / _expected_a(resting[0])
-    std_percent = [floor.std_percent for floor in drawn[0]]
-    reported = np.mean(std_percent) / 100.0
-    # 120 estimates: their mean is known to std_percent/√120, their scatter to 1/√240 of itself;
-    # three of those.
-    assert relative.mean() == pytest.approx(1.0, abs=3.0 * reported / np.sqrt(relative.size) + 0.01)
-    assert relative.std() == pytest.approx(reported, rel=0.25)
+    draws = [_all(noise_floors(_noisy(resting, seed), CONDITIONING)) for seed in range(20)]
+    # 120 estimates: their scatter is known to 1/√240 of itself; three of those and a little.
+    _assert_unbiased(draws, _expected_a(resting[0]), rel_of_std=0.25)
 
 
 @pytest.mark.slow
@@ -131,9 +161,9 @@ def test_the_lower_limit_is_below_the_noise_as_often_as_it_says(
     for seed in range(40):
         datasets = _noisy(resting, seed)
         floors = _all(noise_floors(datasets, CONDITIONING))
-        for floor, expected in zip(floors, _expected_a(resting[0]), strict=True):
-            above.append(floor.noise_a > expected)
-            above_limit.append(floor.least_a > expected)
+        for floor, expected_a in zip(floors, _expected_a(resting[0]), strict=True):
+            above.append(floor.noise_a > expected_a)
+            above_limit.append(floor.least_a > expected_a)
             assert 0.7 * floor.noise_a < floor.least_a < floor.noise_a
     draws = len(above)
     assert 0.35 * draws < sum(above) < 0.65 * draws
@@ -148,44 +178,50 @@ def test_slips_in_some_dwells_do_not_become_the_noise(resting: tuple[Dataset, ..
     """
     slipping = []
     for data in _noisy(resting):
-        current = data.current_a.copy()
-        for motor, still in enumerate(~data.motor_moving.T):
-            for part in _parts(still)[::4]:
-                current[(part.start + part.stop) // 2 : part.stop, motor] += 200.0 * NOISE_A[motor]
-        slipping.append(replace(data, current_a=current))
+        current_a = data.current_a.copy()
+        for motor, moving in enumerate(data.motor_moving.T):
+            step_a = 200.0 * NOISE_A[motor]
+            for dwell in _dwells(~moving)[::4]:
+                middle = (dwell.start + dwell.stop) // 2
+                current_a[middle : dwell.stop, motor] += step_a
+        slipping.append(replace(data, current_a=current_a))
     floors = noise_floors(slipping, CONDITIONING)
-    for floor, expected in zip(_all(floors), _expected_a(resting[0]), strict=True):
-        assert floor.noise_a < 2.0 * expected
+    for floor, expected_a in zip(_all(floors), _expected_a(resting[0]), strict=True):
+        assert floor.noise_a < 2.0 * expected_a
 
 
 def test_what_moves_or_is_invalid_has_no_say(resting: tuple[Dataset, ...]) -> None:
     noisy = _noisy(resting)
-    elsewhere = [
-        replace(data, current_a=np.where(data.motor_moving, 99.0 * data.current_a, data.current_a))
-        for data in noisy
-    ]
+
+    def loud_in_motion(data: Dataset) -> Dataset:
+        current_a = np.where(data.motor_moving, 99.0 * data.current_a, data.current_a)
+        return replace(data, current_a=current_a)
+
+    elsewhere = [loud_in_motion(data) for data in noisy]
     assert noise_floors(elsewhere, CONDITIONING) == noise_floors(noisy, CONDITIONING)
-    unseen = [replace(data, valid=np.zeros_like(data.valid)) for data in noisy]
-    expected = (None,) * 6
-    assert noise_floors(unseen, CONDITIONING) == expected
+    invalid = [replace(data, valid=np.zeros_like(data.valid)) for data in noisy]
+    assert noise_floors(invalid, CONDITIONING) == (None,) * 6
 
 
-def test_too_few_dwells_and_a_drive_that_reports_a_constant_report_nothing(
-    resting: tuple[Dataset, ...],
-) -> None:
-    (first, *_) = _noisy(resting)
-    short = slice(0, round(6.0 * first.rate_hz))
-    cut = replace(
+def test_too_few_dwells_report_nothing(resting: tuple[Dataset, ...]) -> None:
+    first, *_ = _noisy(resting)
+    beginning = slice(0, round(6.0 * first.rate_hz))
+    short = replace(
         first,
-        time_s=first.time_s[short],
-        current_a=first.current_a[short],
-        motor_moving=first.motor_moving[short],
-        valid=first.valid[short],
+        time_s=first.time_s[beginning],
+        current_a=first.current_a[beginning],
+        motor_moving=first.motor_moving[beginning],
+        valid=first.valid[beginning],
     )
-    expected = (None,) * 6
-    assert noise_floors((cut,), CONDITIONING) == expected
+    assert noise_floors((short,), CONDITIONING) == (None,) * 6
+
+
+def test_a_drive_that_reports_a_constant_reports_nothing(resting: tuple[Dataset, ...]) -> None:
     switched_off = [replace(data, current_a=np.zeros_like(data.current_a)) for data in resting]
     assert noise_floors(switched_off, CONDITIONING) == (None,) * 6
+
+
+def test_motors_that_never_rest_report_nothing(resting: tuple[Dataset, ...]) -> None:
     always_moving = [
         replace(data, motor_moving=np.ones_like(data.motor_moving)) for data in resting
     ]
@@ -195,18 +231,16 @@ def test_too_few_dwells_and_a_drive_that_reports_a_constant_report_nothing(
 def test_an_axis_that_rests_throughout_a_run_counts_as_many_dwells(
     repeated: tuple[Dataset, ...],
 ) -> None:
-    motor_moving = np.zeros_like(repeated[0].motor_moving)
-    current_a = np.zeros_like(repeated[0].current_a)
+    first = repeated[0]
     still = replace(
-        repeated[0],
-        motor_moving=motor_moving,
-        current_a=current_a,
+        first,
+        motor_moving=np.zeros_like(first.motor_moving),
+        current_a=np.zeros_like(first.current_a),
     )
-    datasets = _noisy([still])
-    floors = noise_floors(datasets, SMALL)
-    for floor, expected in zip(_all(floors), _expected_a(still), strict=True):
+    floors = noise_floors(_noisy([still]), SMALL)
+    for floor, expected_a in zip(_all(floors), _expected_a(still), strict=True):
         assert floor.parts == 11
-        assert floor.noise_a == pytest.approx(expected, rel=DEVIATIONS * floor.std_percent / 100.0)
+        assert _is_within_its_error(floor, expected_a)
 
 
 @pytest.mark.slow
@@ -218,22 +252,24 @@ def test_it_has_the_unit_of_the_current_and_no_offset(
     noisy = _noisy(resting[:2])
     floors = _all(noise_floors(noisy, CONDITIONING))
     scaled = [replace(data, current_a=factor * (data.current_a + offset)) for data in noisy]
-    for one, other in zip(floors, _all(noise_floors(scaled, CONDITIONING)), strict=True):
-        assert other.noise_a == pytest.approx(factor * one.noise_a, rel=1e-6)
-        expected = (one.parts, one.freedom)
-        assert (other.parts, other.freedom) == expected
+    scaled_floors = _all(noise_floors(scaled, CONDITIONING))
+    for floor, scaled_floor in zip(floors, scaled_floors, strict=True):
+        assert scaled_floor.noise_a == pytest.approx(factor * floor.noise_a, rel=1e-6)
+        assert scaled_floor.parts == floor.parts
+        assert scaled_floor.freedom == floor.freedom
 
 
 def test_standstill_alone_is_no_bound(
     resting: tuple[Dataset, ...], repeated: tuple[Dataset, ...]
 ) -> None:
-    floors = noise_floors(_noisy(resting), CONDITIONING, (FloorSource.STANDSTILL,))
-    at_rest = _all(floors)
+    standstill = (FloorSource.STANDSTILL,)
+    at_rest = _all(noise_floors(_noisy(resting), CONDITIONING, standstill))
     assert not any(floor.is_bound for floor in at_rest)
     in_motion = _all(noise_floors(_noisy(repeated), SMALL, MOVES))
     assert all(floor.is_bound for floor in in_motion)
     # Where standstill shows less than repeated moves, it is below the noise in motion as well.
-    assert all(floor.is_bound for floor in _all(noise_floors(_noisy(repeated), SMALL)))
+    of_both = _all(noise_floors(_noisy(repeated), SMALL))
+    assert all(floor.is_bound for floor in of_both)
 
 
 @pytest.mark.slow
@@ -241,43 +277,36 @@ def test_repeated_moves_recover_a_known_noise(repeated: tuple[Dataset, ...]) -> 
     """Torques of the motion cancel, ten times larger than the noise in a row;
     the start of a move is no sample.
     """
-    drawn = [_all(noise_floors(_noisy(repeated, seed), SMALL, MOVES)) for seed in range(20)]
-    assert all(
-        floor.source is FloorSource.REPEATED_MOVES and floor.parts > 30 for floor in drawn[0]
-    )
-    noise_a = []
-    for floors in drawn:
-        noise_a.append([floor.noise_a for floor in floors])
-    relative = np.array(noise_a) / _expected_a(repeated[0])
-    std_percent = [floor.std_percent for floor in drawn[0]]
-    reported = np.mean(std_percent) / 100.0
-    assert relative.mean() == pytest.approx(1.0, abs=3.0 * reported / np.sqrt(relative.size) + 0.01)
+    draws = [_all(noise_floors(_noisy(repeated, seed), SMALL, MOVES)) for seed in range(20)]
+    for floor in draws[0]:
+        assert floor.source is FloorSource.REPEATED_MOVES
+        assert floor.parts > 30
     # 60 estimates: their scatter is known to 1/√120 of itself, 9 %; three of those.
-    assert relative.std() == pytest.approx(reported, rel=0.27)
+    _assert_unbiased(draws, _expected_a(repeated[0]), rel_of_std=0.27)
 
 
 def test_pairs_that_share_a_move_have_less_freedom(repeated: tuple[Dataset, ...]) -> None:
     """Three repetitions have 8/5 of the freedom of two, not twice (von Neumann et al. 1941)."""
-    same = _noisy((repeated[0],) * 3)
-    three, two = (_all(noise_floors(runs, SMALL, MOVES)) for runs in (same, same[:2]))
-    for many, few in zip(three, two, strict=True):
-        expected = 2 * few.parts
-        assert many.parts == expected
-        assert many.freedom == pytest.approx(1.6 * few.freedom)
+    runs = _noisy((repeated[0],) * 3)
+    of_three = _all(noise_floors(runs, SMALL, MOVES))
+    of_two = _all(noise_floors(runs[:2], SMALL, MOVES))
+    for three, two in zip(of_three, of_two, strict=True):
+        assert three.parts == 2 * two.parts
+        assert three.freedom == pytest.approx(8 / 5 * two.freedom)
 
 
 def test_friction_that_changes_between_repetitions_is_no_noise(
     repeated: tuple[Dataset, ...],
 ) -> None:
     noisy = _noisy(repeated)
-    warming = [
-        replace(data, current_a=data.current_a + 5.0 * number * np.sign(data.velocity_rad_s))
-        for number, data in enumerate(noisy)
-    ]
-    for one, other in zip(
-        *(_all(noise_floors(runs, SMALL, MOVES)) for runs in (noisy, warming)), strict=True
-    ):
-        assert other.noise_a == pytest.approx(one.noise_a, rel=1e-6)
+    warming = []
+    for number, data in enumerate(noisy):
+        friction_a = 5.0 * number * np.sign(data.velocity_rad_s)
+        warming.append(replace(data, current_a=data.current_a + friction_a))
+    floors = _all(noise_floors(noisy, SMALL, MOVES))
+    warming_floors = _all(noise_floors(warming, SMALL, MOVES))
+    for floor, warming_floor in zip(floors, warming_floors, strict=True):
+        assert warming_floor.noise_a == pytest.approx(floor.noise_a, rel=1e-6)
 
 
 def test_motion_that_a_disturbance_causes_is_no_noise(small_truth: Truth) -> None:
@@ -285,20 +314,20 @@ def test_motion_that_a_disturbance_causes_is_no_noise(small_truth: Truth) -> Non
     it would make the floor of axis 2 twice as high.
     """
 
-    def run(number: int) -> Dataset:
-        def shaken(q: FloatArray) -> FloatArray:
-            phase = np.array([0.0, 1.0, 2.0]) + 2.5 * number
-            phase_sine = np.sin(0.05 * np.arange(len(q))[:, None] + phase)
-            return np.asarray(q + 1e-3 * phase_sine)
+    def shaken(position: FloatArray, number: int) -> FloatArray:
+        phase = np.array([0.0, 1.0, 2.0]) + 2.5 * number
+        angle = 0.05 * np.arange(len(position))[:, None]
+        return np.asarray(position + 1e-3 * np.sin(angle + phase))
 
-        rng = np.random.default_rng(8)
-        made = record(small_truth, f"run{number}", rng, seconds=22.0, bend=shaken)
-        return differentiate(made, small_truth.model.drive_train, SMALL)
-
-    runs = _noisy([run(0), run(1)])
+    runs = _noisy(
+        [
+            _small_run(small_truth, 0, lambda position: shaken(position, 0)),
+            _small_run(small_truth, 1, lambda position: shaken(position, 1)),
+        ]
+    )
     floors = noise_floors(runs, SMALL, MOVES)
-    for floor, expected in zip(_all(floors), _expected_a(runs[0]), strict=True):
-        assert floor.noise_a == pytest.approx(expected, rel=DEVIATIONS * floor.std_percent / 100.0)
+    for floor, expected_a in zip(_all(floors), _expected_a(runs[0]), strict=True):
+        assert _is_within_its_error(floor, expected_a)
 
 
 @pytest.mark.parametrize(
@@ -310,37 +339,32 @@ def test_the_smaller_of_both_estimates_is_taken(
 ) -> None:
     """A robot that hunts at standstill, and one that is disturbed in motion."""
     rng = np.random.default_rng(2)
+    quiet_at_rest = [
+        replace(data, current_a=data.current_a * data.motor_moving) for data in repeated
+    ]
     runs = []
-    for data in _noisy(
-        [replace(data, current_a=data.current_a * data.motor_moving) for data in repeated]
-    ):
-        loud = (
-            3.0 * rng.standard_normal(data.current_a.shape) * (data.motor_moving == loud_in_motion)
-        )
-        current_a = data.current_a + loud
-        runs.append(replace(data, current_a=current_a))
+    for data in _noisy(quiet_at_rest):
+        is_loud = data.motor_moving == loud_in_motion
+        loud_a = 3.0 * rng.standard_normal(data.current_a.shape) * is_loud
+        runs.append(replace(data, current_a=data.current_a + loud_a))
     floors = noise_floors(runs, SMALL)
-    for floor, expected in zip(_all(floors), _expected_a(runs[0]), strict=True):
+    for floor, expected_a in zip(_all(floors), _expected_a(runs[0]), strict=True):
         assert floor.source is source
-        assert floor.noise_a == pytest.approx(expected, rel=DEVIATIONS * floor.std_percent / 100.0)
+        assert _is_within_its_error(floor, expected_a)
 
 
 def test_other_paths_payloads_and_rates_are_no_repetition(repeated: tuple[Dataset, ...]) -> None:
     first, second, _ = _noisy(repeated)
-    position_rad = second.position_rad + np.array([0.05, 0.0, 0.0])
-    rate_hz = 1.01 * second.rate_hz
-    valid = np.zeros_like(second.valid)
+    one_percent_of_travel = np.array([0.05, 0.0, 0.0])
     others = (
-        # 1 % of the travel
-        replace(second, position_rad=position_rad),
+        replace(second, position_rad=second.position_rad + one_percent_of_travel),
         replace(second, payload=MOUNTED),
-        replace(second, rate_hz=rate_hz),
-        replace(second, valid=valid),
+        replace(second, rate_hz=1.01 * second.rate_hz),
+        replace(second, valid=np.zeros_like(second.valid)),
         first,  # one run given twice
     )
     for other in others:
-        expected = (None,) * 3
-        assert noise_floors((first, other), SMALL, MOVES) == expected
+        assert noise_floors((first, other), SMALL, MOVES) == (None,) * 3
 
 
 def test_a_floor_far_above_the_error_of_a_model_is_refuted() -> None:

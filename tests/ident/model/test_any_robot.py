@@ -32,7 +32,10 @@ UPRIGHT: Gravity = (0.0, 0.0, -9.81)
 LEANING: Gravity = (5.6, -3.2, 7.4)
 RATE_HZ = 250.0
 SCREW = 2.0 * np.pi / 0.02
+"""Ratio of a screw with a lead of 20 mm [rad/m]."""
 BELT = 5.0 * 2.0 * np.pi / 0.15
+"""Ratio of a gear of 5 before a belt that moves by 150 mm a turn [rad/m]."""
+JOINT_COLUMNS = 14  #: parameters of a joint: 10 of its link, then Ia, fv, fs and off
 
 
 @dataclass(frozen=True)
@@ -103,7 +106,12 @@ HEAVY = (
 """Beside these: in a chain of couplings a motor in another's place belongs to another joint,
 so that other rows count; and a heavy arm that leans is refused, not only fitted badly.
 """
-CASES = list(product((*KINDS, *HEAVY), (UPRIGHT, LEANING)))
+ALL_KINDS = (*KINDS, *HEAVY)
+CASES = list(product(ALL_KINDS, (UPRIGHT, LEANING)))
+
+
+def _kind(urdf: str) -> Kind:
+    return next(kind for kind in ALL_KINDS if kind.urdf == urdf)
 
 
 def _name(value: object) -> str:
@@ -117,39 +125,47 @@ def _truth(urdf: str, gravity: Gravity) -> tuple[Model, FloatArray, FloatArray]:
     """Model, standard parameters, and the inertial ones of a payload of 5 kg about the last joint's
     frame.
     """
-    kind = next(kind for kind in (*KINDS, *HEAVY) if kind.urdf == urdf)
     text = (CONFIGS / "robots" / urdf).read_text()
     robot = robot_from_urdf(text, gravity)
-    drive_train = DriveTrain(kind.ratio)
+    drive_train = DriveTrain(_kind(urdf).ratio)
     model = Model(robot, drive_train)
     rng = np.random.default_rng(len(urdf))
     parameters = np.zeros(len(model.columns))
-    for joint in range(model.robot.joint_count):
-        first = 14 * joint
+    for joint in range(robot.joint_count):
         mass = rng.uniform(1.0, 8.0)
-        parameters[first : first + 10] = _body(rng, mass)
-        parameters[first + 10 : first + 14] = (
-            rng.uniform(0.05, 0.3),
-            *rng.uniform(0.5, 5.0, 2),
-            rng.uniform(-0.3, 0.3),
-        )
-    extra = len(parameters) - 14 * model.robot.joint_count
-    parameters[len(parameters) - extra :] = rng.uniform(0.05, 0.5, extra)
-    return model, parameters, _body(rng, 5.0)
+        link = _body(rng, mass)
+        drive = _drive(rng)
+        first = JOINT_COLUMNS * joint
+        parameters[first : first + JOINT_COLUMNS] = np.concatenate((link, drive))
+    # Rotors and friction of coupled motors follow those of the joints.
+    coupled = parameters[JOINT_COLUMNS * robot.joint_count :]
+    coupled[:] = rng.uniform(0.05, 0.5, coupled.size)
+    payload = _body(rng, 5.0)
+    return model, parameters, payload
 
 
 def _body(rng: np.random.Generator, mass: float) -> FloatArray:
+    """Inertial parameters of a body about its frame, in the order of LINK_PARAMETERS."""
     centre = rng.uniform(-0.1, 0.1, 3)
-    centre_outer = np.outer(centre, centre)
-    inertia = mass * (np.eye(3) * (0.06**2 + centre @ centre) - centre_outer)
+    gyration_m = 0.06
+    # Parallel axes: I = m ((r² + |c|²) E − c cᵀ).
+    diagonal = (gyration_m**2 + centre @ centre) * np.eye(3)
+    inertia = mass * (diagonal - np.outer(centre, centre))
     return np.concatenate((inertia[np.triu_indices(3)], mass * centre, [mass]))
 
 
+def _drive(rng: np.random.Generator) -> FloatArray:
+    """Rotor inertia, viscous and dry friction and offset of a joint's own motor."""
+    rotor = rng.uniform(0.05, 0.3)
+    viscous, dry = rng.uniform(0.5, 5.0, 2)
+    offset = rng.uniform(-0.3, 0.3)
+    return np.array([rotor, viscous, dry, offset])
+
+
 def _conditioning(model: Model) -> Conditioning:
-    still = tuple(
-        0.005 if joint.kind is JointKind.PRISMATIC else 0.03 for joint in model.robot.joints
-    )
-    return Conditioning(standstill_rad_s=still)
+    standstill_of = {JointKind.PRISMATIC: 0.005, JointKind.REVOLUTE: 0.03}
+    standstill = tuple(standstill_of[joint.kind] for joint in model.robot.joints)
+    return Conditioning(standstill_rad_s=standstill)
 
 
 @cache
@@ -157,38 +173,48 @@ def _runs(urdf: str, gravity: Gravity) -> tuple[Run, Run]:
     """Without and with the payload; the current is exactly what the model needs for the filtered
     motion.
     """
-    kind = next(kind for kind in (*KINDS, *HEAVY) if kind.urdf == urdf)
+    kind = _kind(urdf)
     model, parameters, payload = _truth(urdf, gravity)
     rng = np.random.default_rng(4)
-    made = []
-    for mounted in (None, Payload("body", "a", {"m": 5.0})):
-        q = positions(rng, 22.0, RATE_HZ, kind.reach)
-        time_s = np.arange(len(q)) / RATE_HZ
-        current_a = np.zeros_like(q)
-        bare = Run(
-            "loaded" if mounted else "bare",
-            time_s,
-            q,
-            current_a,
-            mounted,
-        )
-        data = differentiate(bare, model.drive_train, _conditioning(model))
-        total = parameters.copy()
-        if mounted is not None:
-            total[model.flange] += payload
-        torque = np.einsum("jck,c->jk", model.regressor(data.motion()), total)
-        current = np.zeros_like(q)
-        current[1:-1] = ((model.drive_train.to_motor @ torque) / kind.gains[:, None]).T
-        run = Run(bare.name, bare.time_s, q, current, mounted)
-        made.append(run)
-    return made[0], made[1]
+    mounted = Payload("body", "a", {"m": 5.0})
+    loaded_parameters = parameters.copy()
+    loaded_parameters[model.flange] += payload
+    bare = _run("bare", None, kind, model, parameters, rng)
+    loaded = _run("loaded", mounted, kind, model, loaded_parameters, rng)
+    return bare, loaded
 
 
-def _fit(model: Model, runs: tuple[Run, ...], still: tuple[float, ...] | None = None) -> Estimate:
+def _run(
+    name: str,
+    mounted: Payload | None,
+    kind: Kind,
+    model: Model,
+    parameters: FloatArray,
+    rng: np.random.Generator,
+) -> Run:
+    q = positions(rng, 22.0, RATE_HZ, kind.reach)
+    time_s = np.arange(len(q)) / RATE_HZ
+    run = Run(name, time_s, q, np.zeros_like(q), mounted)
+    data = differentiate(run, model.drive_train, _conditioning(model))
+    joint_torque = np.einsum("jck,c->jk", model.regressor(data.motion()), parameters)
+    motor_torque = model.drive_train.to_motor @ joint_torque
+    current_a = np.zeros_like(q)
+    current_a[1:-1] = (motor_torque / kind.gains[:, None]).T
+    return replace(run, current_a=current_a)
+
+
+def _fit(
+    model: Model, runs: tuple[Run, ...], standstill: tuple[float, ...] | None = None
+) -> Estimate:
     conditioning = _conditioning(model)
-    return identify(
-        model, runs, conditioning if still is None else Conditioning(standstill_rad_s=still)
-    ).estimate
+    if standstill is not None:
+        conditioning = Conditioning(standstill_rad_s=standstill)
+    return identify(model, runs, conditioning).estimate
+
+
+def _named_parameters(estimate: Estimate) -> dict[str, float]:
+    names = (column.name for column in estimate.unknowns)
+    return dict(zip(names, estimate.parameters, strict=True))
 
 
 @pytest.mark.parametrize(("kind", "gravity"), CASES, ids=_name)
@@ -197,10 +223,20 @@ def test_without_noise_the_gains_are_exact(kind: Kind, gravity: Gravity) -> None
     runs = _runs(kind.urdf, gravity)
     estimate = _fit(model, runs)
     assert estimate.gains == pytest.approx(kind.gains, rel=1e-6)
-    names = [column.name for column in estimate.unknowns]
+    parameters = _named_parameters(estimate)
     for name in ("mx", "my", "mz"):
-        found = estimate.parameters[names.index(f"{name}:a")]
-        assert found == pytest.approx(payload[LINK_PARAMETERS.index(name)], rel=1e-4, abs=1e-6)
+        found = parameters[f"{name}:a"]
+        expected = payload[LINK_PARAMETERS.index(name)]
+        assert found == pytest.approx(expected, rel=1e-4, abs=1e-6)
+
+
+def _is_link_parameter(name: str) -> bool:
+    return name.startswith(("I", "m")) and "Iam" not in name
+
+
+def _with_noise(run: Run, rng: np.random.Generator) -> Run:
+    noise = rng.standard_normal(run.current_a.shape)
+    return replace(run, current_a=run.current_a * (1 + 0.02 * noise))
 
 
 @pytest.mark.slow
@@ -216,31 +252,28 @@ def test_permuting_the_motors_permutes_the_gains_and_nothing_else(
     """
     model, _, _ = _truth(kind.urdf, UPRIGHT)
     rng = np.random.default_rng(9)
-    runs = tuple(
-        replace(
-            run, current_a=run.current_a * (1 + 0.02 * rng.standard_normal(run.current_a.shape))
-        )
-        for run in _runs(kind.urdf, UPRIGHT)
-    )
+    runs = tuple(_with_noise(run, rng) for run in _runs(kind.urdf, UPRIGHT))
     order = np.array(data.draw(st.permutations(range(len(kind.gains)))))
-    train = DriveTrain(kind.ratio[order])
     shuffled = tuple(replace(run, current_a=run.current_a[:, order]) for run in runs)
+    shuffled_train = DriveTrain(kind.ratio[order])
     # One speed for all: which rows count must not depend on the order either.
-    still = (0.02,) * len(order)
-    before = _fit(model, runs, still)
-    after = _fit(Model(model.robot, train), shuffled, still)
-    per_motor = before.gains / model.drive_train.reduction
-    assert after.gains / train.reduction == pytest.approx(per_motor[order], rel=1e-6)
-    absolute_reduction = np.abs(model.drive_train.reduction)
-    spread = before.gains_std / absolute_reduction
-    assert after.gains_std / np.abs(train.reduction) == pytest.approx(spread[order], rel=1e-4)
-    known = dict(zip((c.name for c in before.unknowns), before.parameters, strict=True))
-    found = dict(zip((c.name for c in after.unknowns), after.parameters, strict=True))
-    links = {
-        name
-        for name in known.keys() & found.keys()
-        if name.startswith(("I", "m")) and "Iam" not in name
-    }
+    standstill = (0.02,) * len(order)
+
+    before = _fit(model, runs, standstill)
+    after = _fit(Model(model.robot, shuffled_train), shuffled, standstill)
+
+    reduction = model.drive_train.reduction
+    shuffled_reduction = shuffled_train.reduction
+    constants = before.gains / reduction
+    shuffled_constants = after.gains / shuffled_reduction
+    assert shuffled_constants == pytest.approx(constants[order], rel=1e-6)
+    std = before.gains_std / np.abs(reduction)
+    shuffled_std = after.gains_std / np.abs(shuffled_reduction)
+    assert shuffled_std == pytest.approx(std[order], rel=1e-4)
+    known = _named_parameters(before)
+    found = _named_parameters(after)
+    in_both = known.keys() & found.keys()
+    links = {name for name in in_both if _is_link_parameter(name)}
     assert len(links) > 0.6 * sum(name.startswith(("I", "m")) for name in known)
     for name in links:
         assert found[name] == pytest.approx(known[name], rel=1e-5, abs=1e-6), name
@@ -252,12 +285,15 @@ def test_the_mounting_must_be_declared(kind: Kind) -> None:
     leaning, _, _ = _truth(kind.urdf, LEANING)
     upright, _, _ = _truth(kind.urdf, UPRIGHT)
     bare = _runs(kind.urdf, LEANING)[:1]
-    right, wrong = (
-        identify(
+
+    def error_percent(model: Model) -> float:
+        identified = identify(
             model, bare, _conditioning(model), method=Method.LS, fixed_gains=kind.gains
-        ).training_error.total
-        for model in (leaning, upright)
-    )
+        )
+        return identified.training_error.total
+
+    right = error_percent(leaning)
+    wrong = error_percent(upright)
     assert right < 1e-4
     # The offsets of prismatic axes take most of a wrong weight: 1.1 % on the gantry, above 40 % on
     # the arms.
@@ -267,11 +303,7 @@ def test_the_mounting_must_be_declared(kind: Kind) -> None:
 def test_prismatic_joints_have_newton_for_their_friction() -> None:
     model, _, _ = _truth("gantry.urdf", UPRIGHT)
     units = {column.name: column.unit for column in model.columns}
-    expected = ("kg", "N/(m/s)", "N", "N")
-    assert (units["Ia1"], units["fv1"], units["fs1"], units["off1"]) == expected
-    assert (units["Ia4"], units["fv4"], units["fs4"], units["off4"]) == (
-        "kg m²",
-        "Nm/(rad/s)",
-        "Nm",
-        "Nm",
-    )
+    of_slide = (units["Ia1"], units["fv1"], units["fs1"], units["off1"])
+    assert of_slide == ("kg", "N/(m/s)", "N", "N")
+    of_wrist = (units["Ia4"], units["fv4"], units["fs4"], units["off4"])
+    assert of_wrist == ("kg m²", "Nm/(rad/s)", "Nm", "Nm")

@@ -15,6 +15,10 @@ from tests.ident.arms import GANTRY, THREE_AXES
 
 # The third motor turns with joints 2 and 3, as a belt along the second link lets it.
 RATIO = np.array([[-90.0, 0.0, 0.0], [0.0, 100.0, 0.0], [0.0, 20.0, 40.0]])
+AXES = 3
+JOINT_COLUMNS = 14  #: 10 of the link, then Ia, fv, fs and off
+COUPLED_COLUMNS = 3  #: Iam, fvm and fsm of a motor that turns with several joints
+LINK_NAMES = ("Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz", "mx", "my", "mz", "m")
 
 
 @pytest.fixture(scope="module")
@@ -69,38 +73,40 @@ def test_a_drive_train_of_fewer_motors_than_axes_is_refused() -> None:
 def test_a_column_of_a_slide_is_in_newton_and_metres() -> None:
     stiffness = Column("spring", "Nm/rad", least=0.0, largest=5.0, about=1.0)
     assert stiffness.at(JointKind.REVOLUTE) == stiffness
-    assert stiffness.at(JointKind.PRISMATIC) == Column(
-        "spring", "N/m", least=0.0, largest=5.0, about=1.0
-    )
+    of_slide = Column("spring", "N/m", least=0.0, largest=5.0, about=1.0)
+    assert stiffness.at(JointKind.PRISMATIC) == of_slide
 
 
 def test_columns_are_named_joint_by_joint_then_by_coupled_motor_then_with_payload(
     model: Model,
 ) -> None:
     names = [column.name for column in model.columns]
-    assert names[9:14] == ["m1", "Ia1", "fv1", "fs1", "off1"]
-    assert names[3 * 14 : 3 * 14 + 3] == ["Iam3", "fvm3", "fsm3"]
-    loaded = names[3 * 14 + 3 :]
-    of_axes = [names[column] for column in model.friction_columns]
-    assert of_axes == ["fv1", "fs1", "fv2", "fs2", "fv3", "fs3", "fvm3", "fsm3"]
-    assert [name[: len(own)] for name, own in zip(loaded, of_axes, strict=True)] == of_axes
+    assert names[9:JOINT_COLUMNS] == ["m1", "Ia1", "fv1", "fs1", "off1"]
+    coupled = AXES * JOINT_COLUMNS
+    with_payload = coupled + COUPLED_COLUMNS
+    assert names[coupled:with_payload] == ["Iam3", "fvm3", "fsm3"]
+    friction = [names[column] for column in model.friction_columns]
+    assert friction == ["fv1", "fs1", "fv2", "fs2", "fv3", "fs3", "fvm3", "fsm3"]
+    for name, own in zip(names[with_payload:], friction, strict=True):
+        assert name.startswith(own)
     assert model.loaded_friction_columns.tolist() == list(range(45, 53))
-    assert names[model.flange] == [
-        "Ixx3", "Ixy3", "Ixz3", "Iyy3", "Iyz3", "Izz3", "mx3", "my3", "mz3", "m3",
-    ]  # fmt: skip
+    assert names[model.flange] == [f"{name}3" for name in LINK_NAMES]
 
 
 def test_units_of_a_slide_and_of_a_turning_joint_differ() -> None:
-    model = Model(robot_from_urdf(GANTRY.urdf), DriveTrain(np.eye(5)))
+    robot = robot_from_urdf(GANTRY.urdf)
+    model = Model(robot, DriveTrain(np.eye(5)))
     units = {column.name: column.unit for column in model.columns}
-    assert (units["Ia1"], units["fv1"], units["fs1"], units["off1"]) == ("kg", "N/(m/s)", "N", "N")
-    assert (units["Ia4"], units["fv4"]) == ("kg m²", "Nm/(rad/s)")
-    assert (units["fs4"], units["off4"]) == ("Nm", "Nm")
+    of_slide = (units["Ia1"], units["fv1"], units["fs1"], units["off1"])
+    assert of_slide == ("kg", "N/(m/s)", "N", "N")
+    of_turning = (units["Ia4"], units["fv4"], units["fs4"], units["off4"])
+    assert of_turning == ("kg m²", "Nm/(rad/s)", "Nm", "Nm")
 
 
 def test_without_payload_friction_there_are_no_columns_of_it() -> None:
-    model = Model(robot_from_urdf(THREE_AXES.urdf), DriveTrain(np.diag([1.0, 2.0, 3.0])))
-    assert len(model.columns) == 42
+    robot = robot_from_urdf(THREE_AXES.urdf)
+    model = Model(robot, DriveTrain(np.diag([1.0, 2.0, 3.0])))
+    assert len(model.columns) == AXES * JOINT_COLUMNS
     assert model.loaded_friction_columns.size == 0
 
 
@@ -124,26 +130,32 @@ def test_a_coupled_rotor_resists_both_of_its_joints(model: Model) -> None:
     motor acts against its own speed.
     """
     standard = np.zeros(len(model.columns))
-    standard[42:45] = (2.0, 3.0, 5.0)
+    inertia = 2.0
+    viscous = 3.0
+    dry = 5.0
+    coupled = AXES * JOINT_COLUMNS
+    standard[coupled : coupled + COUPLED_COLUMNS] = (inertia, viscous, dry)
     still = np.zeros((1, 3))
     velocity = np.array([[0.0, 1.0, -2.0]])
     acceleration = np.array([[0.0, 4.0, 6.0]])
     _, _, total = model.torques(Motion(still, velocity, acceleration), standard)
-    # Motor speed 0.5·1 − 2 < 0.
-    on_joint_2 = 0.5 * (2.0 * 6.0 + 3.0 * -2.0) - 0.5 * 5.0
-    on_joint_3 = 0.5 * (2.0 * 4.0 + 3.0 * 1.0) - 5.0
+    # The motor's speed 0.5·1 − 2 is below 0, so that its dry friction acts backwards.
+    on_joint_2 = 0.5 * (inertia * 6.0 + viscous * -2.0) - 0.5 * dry
+    on_joint_3 = 0.5 * (inertia * 4.0 + viscous * 1.0) - dry
     assert_allclose(total[:, 0], [0.0, on_joint_2, on_joint_3], atol=1e-12)
 
 
 def test_columns_that_cannot_load_an_axis_are_zero_in_the_regressor(
     model: Model, motion: Motion
 ) -> None:
-    found = np.abs(model.regressor(motion, loaded=True)).max(axis=2) > 0.0
-    assert not (found & ~model.support).any()
+    regressor = model.regressor(motion, loaded=True)
+    is_used = np.any(regressor != 0.0, axis=2)
+    assert not (is_used & ~model.support).any()
     # A link loads its own joint and those before it, not those behind.
     assert model.support[0, model.link_columns[2]].all()
     assert not model.support[2, model.link_columns[1]].any()
-    assert not model.support[0, 14 + 10]
+    rotor_of_joint_2 = JOINT_COLUMNS + len(LINK_NAMES)
+    assert not model.support[0, rotor_of_joint_2]
 
 
 def test_what_is_mounted_adds_its_body_and_the_friction_of_its_load(model: Model) -> None:
@@ -153,7 +165,8 @@ def test_what_is_mounted_adds_its_body_and_the_friction_of_its_load(model: Model
     added = loaded - standard
     assert_allclose(added[model.flange], 100.0)
     assert_allclose(added[model.friction_columns], standard[model.loaded_friction_columns])
-    assert np.count_nonzero(added) == 10 + 8
+    friction_count = 8  # viscous and dry, of three joints and a coupled motor
+    assert np.count_nonzero(added) == len(LINK_NAMES) + friction_count
     assert model.with_payload(standard, None) is standard
 
 
@@ -174,9 +187,9 @@ def test_the_mass_matrix_is_the_torque_of_a_unit_acceleration(model: Model) -> N
     still = np.zeros((4, 3))
     weight, _, _ = model.torques(Motion(position, still, still), standard)
     for joint in range(3):
-        unit = np.zeros((4, 3))
-        unit[:, joint] = 1.0
-        load, _, _ = model.torques(Motion(position, still, unit), standard)
+        unit_acceleration = np.zeros((4, 3))
+        unit_acceleration[:, joint] = 1.0
+        load, _, _ = model.torques(Motion(position, still, unit_acceleration), standard)
         assert_allclose(load - weight, matrix[:, joint], rtol=1e-9, atol=1e-9)
 
 
