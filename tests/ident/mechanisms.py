@@ -208,7 +208,7 @@ WIDTH_M = 0.08
 def _three_legs() -> Mechanism:
     """A slide along each axis, and a parallelogram from it to a platform that only translates."""
     urdf = _Urdf("three-legs")
-    # Leg n has the axes x, y, z where leg 0 has them shifted by n.
+    # These turn the x axis of leg n onto the x, y or z axis of the base.
     directions = (
         "0 0 0",
         "1.5707963267948966 0 1.5707963267948966",

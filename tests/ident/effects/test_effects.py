@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import chain, combinations
 from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 
 from ident.discovery.structure import VARIABLES
@@ -41,55 +42,42 @@ def random_signals(seed: int) -> Signals:
     """Signals of thirteen joints without mechanics between them."""
     rng = np.random.default_rng(seed)
     position, velocity, acceleration, load, motor, geared = rng.normal(size=(6, JOINTS, SAMPLES))
-    torque = np.cumsum(motor, axis=1)
+    motor_torque_nm = np.cumsum(motor, axis=1)
     time_s = np.arange(SAMPLES) / 100.0
-    inertia_kg_m2 = rng.normal(size=(JOINTS, JOINTS, SAMPLES))
-    temperature_c = 45.0 + 5.0 * rng.normal(size=(JOINTS, SAMPLES))
-    session_s = 5.0 + time_s
-    position_rad = 2.0 * position
-    motor_position_rad = 30.0 * position
-    current_a = torque / 20.0
     return Signals(
         rate_hz=100.0,
         time_s=time_s,
-        session_s=session_s,
-        position_rad=position_rad,
+        session_s=5.0 + time_s,
+        position_rad=2.0 * position,
         velocity_rad_s=velocity,
         acceleration_rad_s2=acceleration,
-        motor_position_rad=motor_position_rad,
-        inertia_kg_m2=inertia_kg_m2,
+        motor_position_rad=30.0 * position,
+        inertia_kg_m2=rng.normal(size=(JOINTS, JOINTS, SAMPLES)),
         load_torque_nm=load,
         geared_torque_nm=geared,
-        motor_torque_nm=torque,
-        current_a=current_a,
-        temperature_c=temperature_c,
+        motor_torque_nm=motor_torque_nm,
+        current_a=motor_torque_nm / 20.0,
+        temperature_c=45.0 + 5.0 * rng.normal(size=(JOINTS, SAMPLES)),
     )
 
 
 def _scaled(s: Signals, factor: float) -> Signals:
-    time_s = factor * s.time_s
-    session_s = factor * s.session_s
-    position_rad = factor * s.position_rad
-    velocity_rad_s = factor * s.velocity_rad_s
-    motor_position_rad = factor * s.motor_position_rad
-    load_torque_nm = factor * s.load_torque_nm
-    motor_torque_nm = factor * s.motor_torque_nm
-    current_a = factor * s.current_a
     return replace(
         s,
-        time_s=time_s,
-        session_s=session_s,
-        position_rad=position_rad,
-        velocity_rad_s=velocity_rad_s,
-        motor_position_rad=motor_position_rad,
-        load_torque_nm=load_torque_nm,
-        motor_torque_nm=motor_torque_nm,
-        current_a=current_a,
+        time_s=factor * s.time_s,
+        session_s=factor * s.session_s,
+        position_rad=factor * s.position_rad,
+        velocity_rad_s=factor * s.velocity_rad_s,
+        motor_position_rad=factor * s.motor_position_rad,
+        load_torque_nm=factor * s.load_torque_nm,
+        motor_torque_nm=factor * s.motor_torque_nm,
+        current_a=factor * s.current_a,
     )
 
 
 def _over_its_range(variable: Abscissa, signed: int, other_axis: int = 0) -> Smooth:
-    x = np.abs(random_signals(5).variable(variable, 0, other_axis - 1 if other_axis else None))
+    other = other_axis - 1 if other_axis else None
+    x = np.abs(random_signals(5).variable(variable, 0, other))
     lower = float(np.quantile(x, 0.05))
     upper = float(np.quantile(x, 0.95))
     return Smooth(variable, lower, upper, signed, other_axis)
@@ -116,26 +104,26 @@ def _members() -> Iterator[Any]:
 MEMBERS = list(_members())
 
 
+def _largest(values: FloatArray) -> float:
+    return float(np.max(np.abs(values)))
+
+
 def _same(one: FloatArray, other: FloatArray) -> bool:
     # A motor angle of a hundred radians and the square of a rate each cost some digits.
-    return np.allclose(one, other, rtol=1e-8, atol=1e-10 * float(np.max(np.abs(other))) + 1e-12)
+    return np.allclose(one, other, rtol=1e-8, atol=1e-10 * _largest(other) + 1e-12)
 
 
-def _is_odd(columns: Callable[[Signals], FloatArray], signals: Signals, reversed_: Signals) -> bool:
-    return _same(columns(reversed_), -columns(signals)) and bool(np.any(columns(signals)))
+def _is_odd(before: FloatArray, reversed_: FloatArray) -> bool:
+    return bool(np.any(before)) and _same(reversed_, -before)
 
 
-def _is_zero_where(
-    columns: Callable[[Signals], FloatArray], signals: Signals, held: Signals
-) -> bool:
-    """Held over the middle half: a filter, forwards or backwards in time,
-    has forgotten the rest in its middle.
+def _is_zero_where_held(free: FloatArray, held: FloatArray) -> bool:
+    """Whether columns are zero where a signal was held over the middle half.
+
+    A filter, forwards or backwards in time, has forgotten the rest in its middle.
     """
-    free = columns(signals)
-    middle = columns(held)[..., SAMPLES // 2 - 5 : SAMPLES // 2 + 5]
-    largest_absolute_middle = np.max(np.abs(middle))
-    largest_absolute_free = np.max(np.abs(free))
-    return bool(largest_absolute_middle <= 1e-7 * largest_absolute_free) and bool(np.any(free))
+    middle = held[..., SAMPLES // 2 - 5 : SAMPLES // 2 + 5]
+    return bool(np.any(free)) and _largest(middle) <= 1e-7 * _largest(free)
 
 
 def _held(value: FloatArray) -> FloatArray:
@@ -149,45 +137,44 @@ def _claim_holds(effect: Effect, claim: Property, axis: int, seed: int) -> bool:
     what it is said of must have a say in them.
     """
     s = random_signals(seed)
-    v = s.velocity_rad_s
+    velocity = s.velocity_rad_s
     angle = s.motor_position_rad
+    columns = effect.columns(s, axis)
 
-    def columns(signals: Signals) -> FloatArray:
-        return effect.columns(signals, axis)
+    def changed(**signals: FloatArray) -> FloatArray:
+        """Columns with other signals."""
+        return effect.columns(replace(s, **signals), axis)  # type: ignore[arg-type]
 
     match claim:
         case Property.ODD_IN_VELOCITY:
-            holds = _is_odd(columns, s, replace(s, velocity_rad_s=-v))
+            holds = _is_odd(columns, changed(velocity_rad_s=-velocity))
         case Property.EVEN_IN_VELOCITY:
-            has_a_say = not _same(columns(replace(s, velocity_rad_s=2.0 * v)), columns(s))
-            holds = has_a_say and _same(columns(replace(s, velocity_rad_s=-v)), columns(s))
+            has_a_say = not _same(changed(velocity_rad_s=2.0 * velocity), columns)
+            holds = has_a_say and _same(changed(velocity_rad_s=-velocity), columns)
         case Property.INDEPENDENT_OF_VELOCITY:
-            holds = _same(columns(replace(s, velocity_rad_s=3.0 + v**2)), columns(s))
+            holds = _same(changed(velocity_rad_s=3.0 + velocity**2), columns)
         case Property.PERIODIC_IN_MOTOR_ANGLE:
-            has_a_say = not _same(columns(replace(s, motor_position_rad=angle + 0.3)), columns(s))
-            holds = has_a_say and _same(
-                columns(replace(s, motor_position_rad=angle + 2.0 * np.pi)), columns(s)
-            )
+            has_a_say = not _same(changed(motor_position_rad=angle + 0.3), columns)
+            holds = has_a_say and _same(changed(motor_position_rad=angle + 2.0 * np.pi), columns)
         case Property.ODD_IN_CURRENT:
-            holds = _is_odd(
-                columns, s, replace(s, motor_torque_nm=-s.motor_torque_nm, current_a=-s.current_a)
-            )
+            reversed_ = changed(motor_torque_nm=-s.motor_torque_nm, current_a=-s.current_a)
+            holds = _is_odd(columns, reversed_)
         case Property.ODD_IN_LOAD:
-            turned = replace(
-                s, load_torque_nm=-s.load_torque_nm, geared_torque_nm=-s.geared_torque_nm
+            reversed_ = changed(
+                load_torque_nm=-s.load_torque_nm, geared_torque_nm=-s.geared_torque_nm
             )
-            holds = _is_odd(columns, s, turned)
+            holds = _is_odd(columns, reversed_)
         case Property.RATE_OF_TORQUE:
-            holds = _is_zero_where(columns, s, replace(s, motor_torque_nm=_held(s.motor_torque_nm)))
+            held = changed(motor_torque_nm=_held(s.motor_torque_nm))
+            holds = _is_zero_where_held(columns, held)
         case Property.RATE_OF_LOAD:
-            holds = _is_zero_where(columns, s, replace(s, load_torque_nm=_held(s.load_torque_nm)))
+            held = changed(load_torque_nm=_held(s.load_torque_nm))
+            holds = _is_zero_where_held(columns, held)
         case Property.SMOOTH:
             # A uniform cubic spline's slope is less than one an interval, and no variable here is
             # more than a hundred times its range; a change by a small part of itself turns no sign.
-            change = columns(_scaled(s, 1.0 + 1e-8)) - columns(s)
-            holds = (
-                bool(np.any(change)) and float(np.max(np.abs(change))) <= 1e-8 * 100.0 * INTERVALS
-            )
+            change = effect.columns(_scaled(s, 1.0 + 1e-8), axis) - columns
+            holds = bool(np.any(change)) and _largest(change) <= 1e-8 * 100.0 * INTERVALS
     return holds
 
 
@@ -236,47 +223,20 @@ def test_every_property_can_be_refuted_and_is_claimed_by_someone() -> None:
 @pytest.mark.parametrize("effect", MEMBERS)
 def test_columns_are_as_many_as_coefficients_and_belong_to_their_axes(effect: Effect) -> None:
     signals = random_signals(5)
-    strange = random_signals(6)
     columns = effect.columns(signals, 0)
-    joints = {
-        GearSide.TWO_JOINTS: (2,),
-        GearSide.ALL_JOINTS: (JOINTS,),
-        GearSide.ALL_MOTORS: (JOINTS,),
-    }.get(effect.side, ())
-    expected = (*joints, len(effect.coefficients), SAMPLES)
-    assert columns.shape == expected
+    assert columns.shape == (*_joints_of_columns(effect), len(effect.coefficients), SAMPLES)
     assert np.all(np.isfinite(columns))
-    constant = np.array(
-        [
-            column.name == "preload" and effect.name == "passive-spring"
-            for column in effect.coefficients
-        ]
-    )
-    columns_range = np.ptp(columns, axis=-1)
-    moving = columns_range > 0
+
+    is_moving = np.ptp(columns, axis=-1) > 0
     if effect.name == "cable":  # each stiffness of one joint alone acts on that joint
-        moving = moving.any(axis=0)
-    assert np.all(moving | constant)
+        is_moving = is_moving.any(axis=0)
+    is_spring = effect.name == "passive-spring"
+    is_constant = [is_spring and column.name == "preload" for column in effect.coefficients]
+    assert np.all(is_moving | np.array(is_constant))
 
-    def changed(axes: list[int]) -> Signals:
-        arrays = {}
-        for name in ("position_rad", "velocity_rad_s", "acceleration_rad_s2", "motor_position_rad", "load_torque_nm",  # noqa: E501
-                     "geared_torque_nm", "motor_torque_nm", "current_a"):  # fmt: skip
-            array = getattr(signals, name).copy()
-            array[axes] = getattr(strange, name)[axes]
-            arrays[name] = array
-        return replace(signals, **arrays)
-
-    if effect.settings.get("other_axis"):
-        other_axis = int(effect.settings["other_axis"])
-        own = [0, other_axis - 1]
-    else:
-        own = [0]
-    if effect.side is GearSide.ALL_MOTORS:
-        own = list(range(JOINTS))
-    assert np.array_equal(
-        effect.columns(changed([axis for axis in range(JOINTS) if axis not in own]), 0), columns
-    )
+    own = _own_axes(effect)
+    others = [axis for axis in range(JOINTS) if axis not in own]
+    assert np.array_equal(effect.columns(_with_other_signals(signals, others), 0), columns)
     # What depends on the clock alone is the same on all axes.
     is_by_time = effect.abscissa in {Abscissa.TIME, Abscissa.SESSION}
     of_the_clock = is_by_time and effect.declares in {
@@ -284,7 +244,48 @@ def test_columns_are_as_many_as_coefficients_and_belong_to_their_axes(effect: Ef
         Property.INDEPENDENT_OF_VELOCITY,
     }
     if not of_the_clock or effect.settings.get("signed"):
-        assert not np.allclose(effect.columns(changed(own), 0), columns)
+        assert not np.allclose(effect.columns(_with_other_signals(signals, own), 0), columns)
+
+
+def _joints_of_columns(effect: Effect) -> tuple[int, ...]:
+    """The axis of an effect's columns that is over the joints, where it has one."""
+    if effect.side is GearSide.TWO_JOINTS:
+        return (2,)
+    if effect.side in {GearSide.ALL_JOINTS, GearSide.ALL_MOTORS}:
+        return (JOINTS,)
+    return ()
+
+
+def _own_axes(effect: Effect) -> list[int]:
+    """Axes of which the signals are in an effect's columns on the first axis."""
+    if effect.side is GearSide.ALL_MOTORS:
+        return list(range(JOINTS))
+    other_axis = int(effect.settings.get("other_axis", 0))
+    if other_axis:
+        return [0, other_axis - 1]
+    return [0]
+
+
+def _with_other_signals(signals: Signals, axes: list[int]) -> Signals:
+    """The signals, with those of these axes taken from another recording."""
+    others = random_signals(6)
+
+    def mixed(array: FloatArray, other: FloatArray) -> FloatArray:
+        array = array.copy()
+        array[axes] = other[axes]
+        return array
+
+    return replace(
+        signals,
+        position_rad=mixed(signals.position_rad, others.position_rad),
+        velocity_rad_s=mixed(signals.velocity_rad_s, others.velocity_rad_s),
+        acceleration_rad_s2=mixed(signals.acceleration_rad_s2, others.acceleration_rad_s2),
+        motor_position_rad=mixed(signals.motor_position_rad, others.motor_position_rad),
+        load_torque_nm=mixed(signals.load_torque_nm, others.load_torque_nm),
+        geared_torque_nm=mixed(signals.geared_torque_nm, others.geared_torque_nm),
+        motor_torque_nm=mixed(signals.motor_torque_nm, others.motor_torque_nm),
+        current_a=mixed(signals.current_a, others.current_a),
+    )
 
 
 def test_columns_act_where_the_effect_says() -> None:
@@ -292,34 +293,35 @@ def test_columns_act_where_the_effect_says() -> None:
     ratio[2, 1] = 25.0
     train = DriveTrain(ratio)
     rng = np.random.default_rng(1)
-    one = rng.normal(size=(2, 7))
-    two = rng.normal(size=(2, 2, 7))
-    all_ = rng.normal(size=(3, 1, 7))
-    at_joint = at_joints(Cogging(1), 2, one, train)
+    of_axis = rng.normal(size=(2, 7))
+    of_pair = rng.normal(size=(2, 2, 7))
+    of_all = rng.normal(size=(3, 1, 7))
+    none = np.zeros((2, 7))
+
     # Motor 3 turns with joints 2 and 3, the second at half the ratio.
-    assert at_joint == pytest.approx(np.stack((0.0 * one, 0.5 * one, one)))
-    assert at_joints(Spring(), 1, one, train) == pytest.approx(
-        np.stack((0.0 * one, one, 0.0 * one))
-    )
-    coupling = Coupling(3, 1)
-    assert at_joints(coupling, 0, two, train) == pytest.approx(
-        np.stack((two[0], 0.0 * one, two[1]))
-    )
-    assert np.array_equal(at_joints(Elasticity(), 1, all_, train), all_)
-    of_motors = np.stack((all_[0], all_[1] + 0.5 * all_[2], all_[2]))
-    assert at_joints(TimeSkew(), 0, all_, train) == pytest.approx(of_motors)
+    at_motor_3 = at_joints(Cogging(1), 2, of_axis, train)
+    assert at_motor_3 == pytest.approx(np.stack((none, 0.5 * of_axis, of_axis)))
+    at_joint_2 = at_joints(Spring(), 1, of_axis, train)
+    assert at_joint_2 == pytest.approx(np.stack((none, of_axis, none)))
+    at_joints_1_and_3 = at_joints(Coupling(3, 1), 0, of_pair, train)
+    assert at_joints_1_and_3 == pytest.approx(np.stack((of_pair[0], none, of_pair[1])))
+    at_all_joints = at_joints(Elasticity(), 1, of_all, train)
+    assert np.array_equal(at_all_joints, of_all)
+    at_all_motors = at_joints(TimeSkew(), 0, of_all, train)
+    expected = np.stack((of_all[0], of_all[1] + 0.5 * of_all[2], of_all[2]))
+    assert at_all_motors == pytest.approx(expected)
 
 
 def test_a_pair_is_named_by_its_lower_axis_and_only_angles_have_a_sine() -> None:
     three = robot_from_urdf(THREE_AXES.urdf)
     gantry = robot_from_urdf(GANTRY.urdf)
-    placed = [axis for axis in range(3) if is_placeable(Coupling(3, 1), axis, three)]
-    assert placed == [0, 1]
-    coupling = Coupling(4, 1)
-    assert not is_placeable(coupling, 0, three)
+    coupled = [axis for axis in range(3) if is_placeable(Coupling(3, 1), axis, three)]
+    assert coupled == [0, 1]
+    assert not is_placeable(Coupling(4, 1), 0, three)
     assert is_placeable(Spring(), 2, three)
     # What all motors share is tried once.
-    assert [axis for axis in range(3) if is_placeable(TimeSkew(), axis, three)] == [0]
+    skewed = [axis for axis in range(3) if is_placeable(TimeSkew(), axis, three)]
+    assert skewed == [0]
     assert is_placeable(PositionFriction(), 0, three)
     assert not is_placeable(PositionFriction(), 0, gantry)
     assert is_placeable(Spring(), 0, gantry)
@@ -344,34 +346,51 @@ class Cubic(AsymmetricViscous):
         return np.asarray(signals.velocity_rad_s[axis] ** 3)[None]
 
 
+@dataclass(frozen=True, slots=True)
+class Span:
+    """What the columns of an effect span on the robot's joints."""
+
+    effect: Effect
+    directions: FloatArray  #: orthonormal, shape (p, joints and samples)
+
+    @property
+    def label(self) -> str:
+        """Name and settings."""
+        settings = ", ".join(f"{value:g}" for value in self.effect.settings.values())
+        return f"{self.effect.name} ({settings})"
+
+    def is_duplicate_of(self, other: Span) -> bool:
+        """Whether the columns of one are in what the columns of the other span."""
+        if self.effect.with_motor != other.effect.with_motor:  # never on the same joint
+            return False
+        cosines = np.linalg.svd(self.directions @ other.directions.T, compute_uv=False)
+        return bool(cosines[-1] > 1.0 - 1e-9)
+
+
+def _span(effect: Effect, runs: tuple[Signals, ...], train: DriveTrain) -> Span:
+    torque_of_runs = [at_joints(effect, 0, effect.columns(run, 0), train) for run in runs]
+    torque = np.concatenate(torque_of_runs, axis=-1)
+    # joint, parameter, sample → parameter, joint and sample
+    columns = np.moveaxis(torque, 1, 0).reshape(torque.shape[1], -1)
+    _, _, directions = np.linalg.svd(columns, full_matrices=False)
+    return Span(effect, directions)
+
+
 def _duplicates(families: tuple[tuple[Effect, ...], ...]) -> list[tuple[str, str]]:
     """Pairs of effects of which one's columns span the other's on the robot's joints:
     they cannot be distinguished.
     """
-    grid = np.linspace(30.0, 50.0, JOINTS)
-    ratio = np.diag(grid)
-    train = DriveTrain(ratio)
+    train = DriveTrain(np.diag(np.linspace(30.0, 50.0, JOINTS)))
     first_run = random_signals(5)
-    rest = random_signals(6)
-    session_s = 300.0 + rest.time_s
-    runs = (first_run, replace(rest, session_s=session_s))
-    spans: list[tuple[str, FloatArray, bool]] = []
-    for effect in chain.from_iterable(families):
-        torque_of_runs = [at_joints(effect, 0, effect.columns(run, 0), train) for run in runs]
-        torque = np.concatenate(torque_of_runs, axis=-1)
-        # joint, parameter, sample → parameter, joint and sample
-        columns = np.moveaxis(torque, 1, 0).reshape(torque.shape[1], -1)
-        directions = np.linalg.svd(columns, full_matrices=False)[2]
-        settings = ", ".join(f"{value:g}" for value in effect.settings.values())
-        spans.append((f"{effect.name} ({settings})", directions, effect.with_motor))
-    pairs = []
-    for (one, first, driven), (other, second, other_driven) in combinations(spans, 2):
-        if driven != other_driven:  # never on the same joint
-            continue
-        smallest = np.linalg.svd(first @ second.T, compute_uv=False)[-1]
-        if smallest > 1.0 - 1e-9:
-            pairs.append((one, other))
-    return pairs
+    later_run = random_signals(6)
+    later_run = replace(later_run, session_s=300.0 + later_run.time_s)
+    runs = (first_run, later_run)
+    spans = [_span(effect, runs, train) for effect in chain.from_iterable(families)]
+    return [
+        (one.label, other.label)
+        for one, other in combinations(spans, 2)
+        if one.is_duplicate_of(other)
+    ]
 
 
 @pytest.mark.slow
@@ -390,26 +409,26 @@ def test_the_rate_behind_a_filter_is_that_of_its_equation(backwards: int) -> Non
     rate_hz = 500.0
     filter_s = 0.012
     start = 100
-    difference = np.arange(300) - start
-    time_s = difference / rate_hz
+    time_s = (np.arange(300) - start) / rate_hz  # since t₀
+    constant = np.full(300, 7.0)
     ramp = np.maximum(time_s, 0.0)
     rate = np.where(time_s > 0.0, -np.expm1(-time_s / filter_s), 0.0)
     if backwards:
         ramp = ramp[::-1]
         rate = -rate[::-1]
     effect = Lag(filter_s, backwards)
-    signals = replace(random_signals(1), rate_hz=rate_hz)
-    motor_torque_nm = np.stack((ramp, np.full(300, 7.0)))
-    found = effect.columns(replace(signals, motor_torque_nm=motor_torque_nm), 0)
-    assert found[0] == pytest.approx(-rate, abs=1e-9)
-    changed_signal = replace(signals, motor_torque_nm=np.full((1, 300), 7.0))
-    assert effect.columns(changed_signal, 0) == pytest.approx(0.0, abs=1e-9)
+    signals = replace(
+        random_signals(1), rate_hz=rate_hz, motor_torque_nm=np.stack((ramp, constant))
+    )
+    of_ramp = effect.columns(signals, 0)
+    assert of_ramp[0] == pytest.approx(-rate, abs=1e-9)
+    of_constant = effect.columns(signals, 1)
+    assert of_constant == pytest.approx(0.0, abs=1e-9)
 
 
 def test_with_no_filter_it_is_the_central_difference() -> None:
     signals = random_signals(1)
-    motor_torque_nm_gradient = np.gradient(signals.motor_torque_nm[2])
-    slope = motor_torque_nm_gradient * signals.rate_hz
+    slope = np.gradient(signals.motor_torque_nm[2]) * signals.rate_hz
     assert Lag().columns(signals, 2)[0] == pytest.approx(-slope)
     assert TimeSkew().columns(signals, 0)[2, 0] == pytest.approx(-slope)
 
@@ -423,49 +442,49 @@ def test_the_rest_of_a_rotor_is_the_derivative_of_a_loss(effect: LoadFriction | 
     s = random_signals(3)
     axis = 2
     step = 1e-7
+
+    def without_rotor(rotor_kg_m2: float, signals: Signals) -> FloatArray:
+        one_column = replace(effect, rotor_inertia_kg_m2=rotor_kg_m2, with_rotor=0)
+        (column,) = one_column.columns(signals, axis)
+        return np.asarray(column)
+
     loss, rest = effect.columns(s, axis)
-    rotor_inertia_kg_m2 = 0.4 - step
-    (before,) = replace(effect, rotor_inertia_kg_m2=rotor_inertia_kg_m2, with_rotor=0).columns(
-        s, axis
+    derivative = (without_rotor(0.4 + step, s) - without_rotor(0.4 - step, s)) / (2.0 * step)
+    assert_allclose(rest, derivative, atol=1e-6)
+    rotor_torque_nm = 0.4 * s.acceleration_rad_s2
+    without_rotor_torque = replace(
+        s,
+        load_torque_nm=s.load_torque_nm - rotor_torque_nm,
+        geared_torque_nm=s.geared_torque_nm - rotor_torque_nm,
     )
-    step_rotor_inertia_kg_m2 = 0.4 + step
-    (after,) = replace(effect, rotor_inertia_kg_m2=step_rotor_inertia_kg_m2, with_rotor=0).columns(
-        s, axis
-    )
-    np.testing.assert_allclose(rest, (after - before) / (2.0 * step), atol=1e-6)
-    load_torque_nm = s.load_torque_nm - 0.4 * s.acceleration_rad_s2
-    bare = replace(s, load_torque_nm=load_torque_nm)
-    geared_torque_nm = s.geared_torque_nm - 0.4 * s.acceleration_rad_s2
-    geared = replace(bare, geared_torque_nm=geared_torque_nm)
-    changed_effect = replace(effect, rotor_inertia_kg_m2=0.0, with_rotor=0)
-    (expected,) = changed_effect.columns(geared, axis)
-    np.testing.assert_allclose(loss, expected, atol=1e-12)
+    assert_allclose(loss, without_rotor(0.0, without_rotor_torque), atol=1e-12)
 
 
 def test_effects_behind_the_gear_leave_a_known_rotor_out() -> None:
     s = random_signals(4)
     axis = 2
-    load_friction = LoadFriction(0, 0.3, 1)
-    loss = PlacedEffect(load_friction, axis)
-    effects = (PlacedEffect(Elasticity(), 1), loss)
-    known = beside_rotors(s, effects)
-    turning_nm = 0.3 * s.acceleration_rad_s2[axis]
-    np.testing.assert_allclose(known.link_torque(axis), s.load_torque_nm[axis] - turning_nm)
-    np.testing.assert_allclose(known.gear_torque(axis), s.geared_torque_nm[axis] - turning_nm)
-    np.testing.assert_allclose(
-        known.variable(Abscissa.LOAD, axis), s.load_torque_nm[axis] - turning_nm
-    )
-    np.testing.assert_allclose(known.link_torque(1), s.load_torque_nm[1])
-    own = np.arange(JOINTS)[:, None] == axis
-    np.testing.assert_allclose(
-        known.inertia(slice(None), axis), s.inertia(slice(None), axis) - 0.3 * own
-    )
-    np.testing.assert_allclose(known.inertia(axis, axis), s.inertia(axis, axis) - 0.3)
-    np.testing.assert_array_equal(known.inertia(slice(None), 1), s.inertia(slice(None), 1))
-    np.testing.assert_array_equal(loss.effect.columns(known, axis), loss.effect.columns(s, axis))
+    rotor_kg_m2 = 0.3
+    loss = PlacedEffect(LoadFriction(0, rotor_kg_m2, 1), axis)
+    known = beside_rotors(s, (PlacedEffect(Elasticity(), 1), loss))
+
+    turning_nm = rotor_kg_m2 * s.acceleration_rad_s2[axis]
+    link_torque_nm = s.load_torque_nm[axis] - turning_nm
+    assert_allclose(known.link_torque(axis), link_torque_nm)
+    assert_allclose(known.gear_torque(axis), s.geared_torque_nm[axis] - turning_nm)
+    assert_allclose(known.variable(Abscissa.LOAD, axis), link_torque_nm)
+    assert_allclose(known.link_torque(1), s.load_torque_nm[1])
+
+    every = slice(None)
+    column = s.inertia(every, axis).copy()
+    column[axis] -= rotor_kg_m2
+    assert_allclose(known.inertia(every, axis), column)
+    assert_allclose(known.inertia(axis, axis), s.inertia(axis, axis) - rotor_kg_m2)
+    assert_array_equal(known.inertia(every, 1), s.inertia(every, 1))
+
+    assert_array_equal(loss.effect.columns(known, axis), loss.effect.columns(s, axis))
     assert not np.allclose(Elasticity().columns(known, axis), Elasticity().columns(s, axis))
-    placed_effect = PlacedEffect(LoadFriction(0), axis)
-    assert beside_rotors(s, (placed_effect,)) is s
+    without_rotor = PlacedEffect(LoadFriction(0), axis)
+    assert beside_rotors(s, (without_rotor,)) is s
 
 
 def test_an_inertial_coupling_against_its_variable_is_a_straight_line() -> None:
