@@ -374,7 +374,7 @@ def _judge(
     possible = [index for index, why in enumerate(ruled_out) if not why]
     if not possible:
         possible = list(range(len(members)))
-    explained = [float(trial.fallen.sum()) for _, trial in members]
+    explained = [float(trial.fall_by_motor.sum()) for _, trial in members]
     best = max(possible, key=lambda index: explained[index])
     effect, trial = members[best]
     before = sizes.before
@@ -383,7 +383,7 @@ def _judge(
     fall = before.sum(axis=1) - after.sum(axis=1)
     # Another motor may supply a joint's torque (R): the drive in question is the one whose residual
     # falls most.
-    motor = int(np.argmax(trial.fallen))
+    motor = int(np.argmax(trial.fall_by_motor))
     error_before = sizes.relative_error(before, motor)
     error_after = sizes.relative_error(after, motor)
     finding = Finding(
@@ -393,7 +393,7 @@ def _judge(
         deviations=trial.deviations,
         probability=_probability_of(best, possible, widths, probability),
         folds_better=float(np.mean(fall > 0)),
-        explained=float(trial.fallen[motor] / sizes.residual[motor]),
+        explained=float(trial.fall_by_motor[motor] / sizes.residual[motor]),
         error_before_percent=100.0 * error_before,
         error_after_percent=100.0 * error_after,
         error_fall=1.0 - error_after / error_before,
@@ -429,8 +429,8 @@ def _with_refusals(finding: Finding, trial: CandidateTrial, gates: Gates) -> Fin
     refusals: list[str] = []
     too_few_moves = ""
     if _may_be_noise(finding, gates):
-        if finding.probability is None or is_tested_on_others(trial.rest):
-            too_few_moves = what_to_record(finding.effect, trial.gram, trial.rest)
+        if finding.probability is None or is_tested_on_others(trial.without_leverage):
+            too_few_moves = what_to_record(finding.effect, trial.gram, trial.without_leverage)
             refusals.append(too_few_moves)
         else:
             refusals.append(f"noise makes one as strong with p = {finding.probability:.3f}")
@@ -484,7 +484,7 @@ def _share_of_excess(
     excess = float(sizes.residual[motor]) - of_noise
     if excess <= 0.0:
         return None
-    return min(float(trial.fallen[motor]) / excess, 1.0)
+    return min(float(trial.fall_by_motor[motor]) / excess, 1.0)
 
 
 def _ruled_out(effect: Effect, trial: CandidateTrial, fewest: int) -> str:
@@ -518,8 +518,8 @@ def chances(trials: tuple[CandidateTrial, ...], rng: np.random.Generator, draws:
     for number, trial in enumerate(trials):
         if moves_behind(trial.gram) >= FEW_MOVES:
             of_many[number] = trial
-        elif trial.rest is not None and is_tested_on_others(trial.rest):
-            of_many[number] = trial.rest
+        elif trial.without_leverage is not None and is_tested_on_others(trial.without_leverage):
+            of_many[number] = trial.without_leverage
         elif moves_behind(trial.gram) >= FEWEST_MOVES:
             of_few[number] = trial
     probability = np.full(len(trials), np.nan)
@@ -635,7 +635,7 @@ def _golden_section(
         (fit,) = search_problem.fits([search_problem.torque(changed, axis)])
         if fit is None:
             return -np.inf
-        return float(fit.fallen.sum())
+        return float(fit.fall_by_motor.sum())
 
     inner = b - GOLDEN * (b - a)
     outer = a + GOLDEN * (b - a)

@@ -140,7 +140,9 @@ class Linearisation:
         gamma = self.gamma[motor]
         return float(diagonal.sum() * noise / gamma)
 
-    def felt(self, torque_nm: FloatArray, to_motor: FloatArray) -> dict[int, FloatArray]:
+    def columns_by_motor(
+        self, torque_nm: FloatArray, to_motor: FloatArray
+    ) -> dict[int, FloatArray]:
         """Whiten columns of joint torque, on the rows of each motor that needs any: (extra, rows).
 
         Args:
@@ -260,7 +262,7 @@ class Linearisation:
 
     def whitened(self, torque_nm: FloatArray, to_motor: FloatArray) -> FloatArray:
         """The same as further columns of the Jacobian, shape (rows, extra)."""
-        by_motor = self.felt(torque_nm, to_motor)
+        by_motor = self.columns_by_motor(torque_nm, to_motor)
         columns = np.zeros((torque_nm.shape[1], len(self.motor)))
         for motor, own in by_motor.items():
             columns[:, self.rows_of(motor)] = own

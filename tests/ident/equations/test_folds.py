@@ -230,7 +230,7 @@ def test_torque_columns_are_whitened_on_the_rows_of_every_motor_that_needs_them(
         assert_allclose(found[row], expected)
     of_second_joint = np.zeros_like(torque_nm)
     of_second_joint[1] = torque_nm[1]
-    motors = problem.felt(of_second_joint, TO_MOTOR)
+    motors = problem.columns_by_motor(of_second_joint, TO_MOTOR)
     assert set(motors) == {1}
 
 
