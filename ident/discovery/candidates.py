@@ -411,7 +411,7 @@ def _with_friction_of_runs(
     friction = np.flatnonzero(is_friction)
     deviation = FRICTION_OF_A_RUN * np.abs(estimate.parameters[friction])
     torque = observation.regressor[:, friction] * deviation[:, None]
-    return problem.beside_scatter(torque, model.drive_train.to_motor, observation.run)
+    return problem.decorrelated_from_runs(torque, model.drive_train.to_motor, observation.run)
 
 
 def _pieces(observation: Observation) -> tuple[IntArray, IntArray]:
