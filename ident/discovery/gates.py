@@ -421,6 +421,12 @@ def values_of(estimate: Estimate, own: IntArray) -> FloatArray:
     return np.asarray(estimate.parameters[own] + applied)
 
 
+def covariance_of(estimate: Estimate, own: IntArray) -> FloatArray:
+    """Covariance of some parameters, shape (p, p); gains come before them in that of all."""
+    index = len(estimate.gains) + own
+    return estimate.covariance[np.ix_(index, index)]
+
+
 def without_effects_of(
     search_problem: SearchProblem, estimate: Estimate, effects: Sequence[PlacedEffect]
 ) -> Reduced:
