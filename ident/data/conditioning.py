@@ -35,14 +35,20 @@ FULL_FILTER_HZ = 125.0
 below, they fall with it.
 """
 
-#: Settings that a document has where the currents went through a low-pass
+#: Settings of the currents' low-pass; a document of currents as they flowed lacks them
 CURRENT_FILTER = ("current_cutoff_hz", "current_order")
-#: Settings that are no number, or that a document may leave out
-NOT_NEEDED = frozenset({"standstill_rad_s", *CURRENT_FILTER})
+#: Settings that a refusal does not list as numbers to give: a list, and optional ones
+NO_REQUIRED_NUMBER = frozenset({"standstill_rad_s", *CURRENT_FILTER})
 
-#: Share of the response of the currents' low-pass that is beyond its window
-FORGOTTEN = 0.01
-RESPONSE_PERIODS = 3.0  #: Periods of its cut-off after which less than that is left
+ROWS_PER_PERIOD = 2.5  #: Rows in a period of the decimation's cut-off: above the two of Nyquist
+#: A Hamming window of N taps has a transition of 3.3/N of the sampling rate
+HAMMING_TRANSITION = 3.3
+
+#: Share of Σ|h| of the currents' low-pass h that its truncation to a finite window drops
+TRUNCATED_SHARE = 0.01
+#: Periods of its cut-off on either side for which h is computed before it is truncated; what is
+#: beyond them is less than TRUNCATED_SHARE
+RESPONSE_PERIODS = 3.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,9 +100,10 @@ class Conditioning:
         for name in CURRENT_FILTER:
             found.setdefault(name, 0)
         lists = [name for name, value in found.items() if isinstance(value, list)]
-        if found.keys() != expected.keys() or lists != ["standstill_rad_s"]:
+        has_one_list = lists == ["standstill_rad_s"]
+        if found.keys() != expected.keys() or not has_one_list:
             given = ", ".join(f"{name}: {value}" for name, value in document.items()) or "nothing"
-            numbers = ", ".join(sorted(expected.keys() - NOT_NEEDED))
+            numbers = ", ".join(sorted(expected.keys() - NO_REQUIRED_NUMBER))
             raise ModelError(
                 f"the filter of the calibration: found {given}; expected a list standstill_rad_s "
                 f"and numbers {numbers}; give `conditioning`, or fit again"
@@ -203,6 +210,7 @@ def low_pass(values: FloatArray, rate_hz: float, cutoff_hz: float, order: int) -
         shape (c, k).
     """
     pad = 3 * (order + 1)
+    # 2 x_end − x_j: the samples next to an end, mirrored at the point of its last sample.
     before = 2.0 * values[:, :1] - values[:, pad:0:-1]
     after = 2.0 * values[:, -1:] - values[:, -2 : -pad - 2 : -1]
     sections = _butterworth(order, cutoff_hz / rate_hz)
@@ -240,6 +248,10 @@ class _Section:
 def _butterworth(order: int, cutoff: float) -> list[_Section]:
     """Sections of second order with gain one at rest, by the bilinear transform.
 
+    w = tan(π cut-off) is the cut-off of the analogue prototype, pre-warped so that the digital
+    filter has its −3 dB where they are asked for (Oppenheim & Schafer, Discrete-Time Signal
+    Processing, ch. 7).
+
     Args:
         order: N; an odd one ends with a section of first order.
         cutoff: as a share of the sampling rate.
@@ -273,6 +285,7 @@ def _filtered(sections: list[_Section], values: FloatArray) -> FloatArray:
 
     start = values[:, :1]
     out = values - start
+    # The three diagonals 1, a_1 and a_2, one a row, as LAPACK stores a band.
     band = np.ones((3, out.shape[1]), order="F")
     for section in sections:
         driven = section.b0 * out
@@ -324,8 +337,8 @@ class Decimator:
         count = self.rows(samples)
         flat = columns.reshape(-1, samples)
         if samples >= LONG_SERIES:
-            series = [self._of_long_series(own, count) for own in flat]
-            return np.reshape(series, (*leading, count))
+            rows = [self._of_long_series(series, count) for series in flat]
+            return np.reshape(rows, (*leading, count))
         return self._of_series(flat, count).reshape(*leading, count)
 
     @property
@@ -341,36 +354,43 @@ class Decimator:
         return taps.reshape(blocks, self.factor)
 
     def _of_series(self, flat: FloatArray, count: int) -> FloatArray:
-        """So many outputs of several series together, shape (c, k) → (c, count)."""
-        taps = self._taps_of_blocks
-        blocks = len(taps)
-        samples = flat.shape[1]
-        length = (count + blocks - 1) * self.factor
-        if samples != length:
-            padded = np.zeros((len(flat), length))
-            padded[:, : min(length, samples)] = flat[:, :length]
-            flat = padded
-        weighted = taps @ flat.reshape(-1, self.factor).T
-        by_block = weighted.reshape(blocks, len(flat), -1)
-        out = np.zeros((len(flat), count))
-        for block, share in enumerate(by_block):
-            out += share[:, block : block + count]
-        return out
+        """The first ``count`` outputs of several series together, shape (c, k) → (c, count).
 
-    def _of_long_series(self, series: FloatArray, count: int) -> FloatArray:
-        """So many outputs of one series, shape (k,) → (count,):
-        it is not copied, and its products stay in the cache's reach.
+        With t_j the j-th block of taps and x_b the b-th block of samples, output r is the sum of
+        t_j · x_r+j over all j.
         """
         taps = self._taps_of_blocks
         blocks = len(taps)
-        whole_blocks = min(count + blocks - 1, len(series) // self.factor)
-        end = whole_blocks * self.factor
-        weighted = taps @ series[:end].reshape(whole_blocks, self.factor).T
+        samples = flat.shape[1]
+        needed = (count + blocks - 1) * self.factor
+        if samples != needed:  # to complete blocks: zeros meet only the zeros behind the last tap
+            padded = np.zeros((len(flat), needed))
+            padded[:, : min(needed, samples)] = flat[:, :needed]
+            flat = padded
+        products = taps @ flat.reshape(-1, self.factor).T
+        by_taps = products.reshape(blocks, len(flat), -1)
+        out = np.zeros((len(flat), count))
+        for block, of_taps in enumerate(by_taps):
+            out += of_taps[:, block : block + count]
+        return out
+
+    def _of_long_series(self, series: FloatArray, count: int) -> FloatArray:
+        """The same of one series, shape (k,) → (count,), without a copy of it.
+
+        Its products stay in the cache's reach. A last block of samples that the series does not
+        fill is met by the last window alone, and only by its last block of taps.
+        """
+        taps = self._taps_of_blocks
+        blocks = len(taps)
+        needed_blocks = count + blocks - 1
+        full_blocks = min(needed_blocks, len(series) // self.factor)
+        end = full_blocks * self.factor
+        products = taps @ series[:end].reshape(full_blocks, self.factor).T
         out = np.zeros(count)
-        for block, share in enumerate(weighted):
-            inside = share[block : block + count]
+        for block, of_taps in enumerate(products):
+            inside = of_taps[block : block + count]
             out[: len(inside)] += inside
-        if whole_blocks < count + blocks - 1:  # the last window ends within a block of samples
+        if full_blocks < needed_blocks:
             rest = series[end:]
             out[-1] += taps[-1, : len(rest)] @ rest
         return out
@@ -381,11 +401,14 @@ def decimator(rate_hz: float, cutoff_hz: float) -> Decimator:
     """Decimator for a sampling rate: Hamming-windowed, −6 dB at the cut-off,
     transition as wide as the cut-off.
     """
-    factor = max(1, round(rate_hz / (2.5 * cutoff_hz)))
-    half = round(3.3 * rate_hz / cutoff_hz / 2.0)
+    rows_per_s = ROWS_PER_PERIOD * cutoff_hz
+    factor = max(1, round(rate_hz / rows_per_s))
+    length = HAMMING_TRANSITION * rate_hz / cutoff_hz
+    half = round(length / 2.0)
     samples = np.arange(-half, half + 1)
-    response = np.sinc(2.0 * cutoff_hz / rate_hz * samples)
-    taps = response * np.hamming(2 * half + 1)
+    # The ideal low-pass, sin(2π f_c t)/(2π f_c t).
+    ideal = np.sinc(2.0 * cutoff_hz / rate_hz * samples)
+    taps = ideal * np.hamming(2 * half + 1)
     return Decimator(taps / taps.sum(), factor)
 
 
@@ -397,8 +420,8 @@ def current_rows(rate_hz: float, conditioning: Conditioning) -> Decimator:
     plain = decimator(rate_hz, conditioning.decimation_cutoff_hz)
     if not conditioning.current_cutoff_hz:
         return plain
-    longer = rows_lost(rate_hz, conditioning) * plain.factor
-    return Decimator(np.pad(plain.taps, longer), plain.factor)
+    zeros_a_side = rows_lost(rate_hz, conditioning) * plain.factor
+    return Decimator(np.pad(plain.taps, zeros_a_side), plain.factor)
 
 
 def torque_rows(rate_hz: float, conditioning: Conditioning) -> Decimator:
@@ -412,21 +435,24 @@ def torque_rows(rate_hz: float, conditioning: Conditioning) -> Decimator:
     response = _current_response(rate_hz, conditioning)
     # A tap weights the sample at its place in the window: the past comes first.
     taps = np.convolve(plain.taps, response[::-1])
-    longer = rows_lost(rate_hz, conditioning) * plain.factor - len(response) // 2
-    return Decimator(np.pad(taps, longer), plain.factor)
+    # The convolution has made the window longer already; zeros make it as long as the currents'.
+    added_a_side = len(response) // 2
+    zeros_a_side = rows_lost(rate_hz, conditioning) * plain.factor - added_a_side
+    return Decimator(np.pad(taps, zeros_a_side), plain.factor)
 
 
 def rows_lost(rate_hz: float, conditioning: Conditioning) -> int:
-    """Rows at either end of a run whose window is not in it for the low-pass of the currents.
+    """Number of rows that a run loses at either end to the low-pass of the currents.
 
-    The others are the rows that the run has without it.
+    Their windows, longer by its response, would reach beyond the run. The other rows are those that
+    the run has without the low-pass.
     """
     plain = decimator(rate_hz, conditioning.decimation_cutoff_hz)
     return ceil(memory_samples(rate_hz, conditioning) / plain.factor)
 
 
 def memory_samples(rate_hz: float, conditioning: Conditioning) -> int:
-    """Samples on either side of one, at some rate, that the low-pass of the currents mixes in."""
+    """Number of samples on either side of one that the low-pass of the currents mixes into it."""
     if not conditioning.current_cutoff_hz:
         return 0
     return len(_current_response(rate_hz, conditioning)) // 2
@@ -447,8 +473,8 @@ def as_recorded(rate_hz: float, conditioning: Conditioning, columns: FloatArray)
         return columns
     response = _current_response(rate_hz, conditioning)
     memory = len(response) // 2
-    around = [(0, 0)] * (columns.ndim - 1) + [(memory, memory)]
-    padded = np.pad(columns, around, mode="edge")
+    along_time_only = [(0, 0)] * (columns.ndim - 1) + [(memory, memory)]
+    padded = np.pad(columns, along_time_only, mode="edge")
     windows = np.lib.stride_tricks.sliding_window_view(padded, len(response), axis=-1)
     return np.asarray(windows @ response[::-1])
 
@@ -460,16 +486,18 @@ def _current_response(rate_hz: float, conditioning: Conditioning) -> FloatArray:
 
 @lru_cache(maxsize=256)
 def _response(rate_hz: float, cutoff_hz: float, order: int) -> FloatArray:
+    """The same for a cut-off and an order, of a length l that drops TRUNCATED_SHARE of Σ|h|."""
     if order:
-        found = _zero_phase_response(rate_hz, cutoff_hz, order)
+        full = _zero_phase_response(rate_hz, cutoff_hz, order)
     else:
-        found = _lag_response(rate_hz, cutoff_hz)
-    middle = len(found) // 2
-    size = np.abs(found)
-    # What both ends together hold, by how many samples are left around the middle
-    inside = size[middle] + np.cumsum(size[middle + 1 :] + size[:middle][::-1])
-    length = 1 + int(np.searchsorted(inside, (1.0 - FORGOTTEN) * inside[-1]))
-    response = found[middle - length : middle + length + 1]
+        full = _lag_response(rate_hz, cutoff_hz)
+    middle = len(full) // 2
+    size = np.abs(full)
+    at_distance = size[middle + 1 :] + size[:middle][::-1]  # on both sides of the middle
+    within = size[middle] + np.cumsum(at_distance)  # Σ|h| up to the distances 1, 2, …
+    kept = (1.0 - TRUNCATED_SHARE) * within[-1]
+    length = 1 + int(np.searchsorted(within, kept))
+    response = full[middle - length : middle + length + 1]
     return np.asarray(response / response.sum())
 
 
@@ -485,13 +513,16 @@ def _lag_response(rate_hz: float, cutoff_hz: float) -> FloatArray:
     """Response of a causal low-pass of first order, as drives have it.
 
     T ẏ + y = x with T = 1/(2π cut-off) is solved exactly for an x that is straight between
-    samples: y_k = a y_k−1 + b_0 x_k + b_1 x_k−1 with w = 1/(rate T), a = e^−w,
-    b_0 = 1 − (1 − a)/w and b_1 = (1 − a)/w − a.
+    samples: y_k = a y_k−1 + b_0 x_k + b_1 x_k−1 with w = 1/(rate T), a = e^−w, b_0 = 1 − μ,
+    b_1 = μ − a and μ = (1 − a)/w, the mean decay over a sample. The response to a unit sample is
+    h_0 = b_0 and h_k = (a b_0 + b_1) a^(k−1).
     """
     w = 2.0 * np.pi * cutoff_hz / rate_hz
     decay = float(np.exp(-w))
-    mean = (1.0 - decay) / w
+    mean_decay = (1.0 - decay) / w
     length = ceil(RESPONSE_PERIODS * rate_hz / cutoff_hz)
-    newest = 1.0 - mean
-    after = (newest * decay + mean - decay) * decay ** np.arange(length)
-    return np.concatenate((np.zeros(length), [newest], after))
+    before = np.zeros(length)
+    first = 1.0 - mean_decay
+    second = first * decay + mean_decay - decay
+    after = second * decay ** np.arange(length)
+    return np.concatenate((before, [first], after))

@@ -33,7 +33,7 @@ from ident.discovery.candidates import ColumnCache
 from ident.discovery.effect_verdict import EffectVerdict, Judgement, judge_change
 from ident.discovery.evidence import Evidence, place_names, with_effects
 from ident.discovery.gates import Gates, require_gates
-from ident.discovery.joining import UNFITTED, JointFit, linearised
+from ident.discovery.joining import FIT_ERRORS, JointFit, linearised
 from ident.discovery.loop import Step, end_search
 from ident.effects.effect import PlacedEffect
 from ident.effects.geometry_corrections import is_correction
@@ -223,7 +223,7 @@ def _verdict(start: Evidence, current: Evidence, placed: PlacedEffect) -> Effect
     is_needed = False
     try:
         without = _without(current, placed)
-    except UNFITTED:
+    except FIT_ERRORS:
         without = start
         is_needed = True
     change = compare_on_holdout(start, without, current)

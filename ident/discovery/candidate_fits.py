@@ -17,8 +17,8 @@ from scipy import linalg
 from ident.arrays import BoolArray, FloatArray, IntArray
 from ident.equations.linearisation import Folds, MotorRows
 
-#: Whitened columns of a candidate on the rows of each motor that feels it, (p, rows)
-Felt = Mapping[int, FloatArray]
+#: Whitened columns of a candidate on the rows of each motor that it loads, (p, rows), by motor
+WhitenedColumns = Mapping[int, FloatArray]
 Result = TypeVar("Result")
 
 #: Columns tested together: enough for fast products, few enough to keep memory small
@@ -33,11 +33,11 @@ class CandidateFit:
     """Result of fitting one candidate to all rows."""
 
     coefficients: FloatArray  #: in the unit of the columns, shape (p,)
-    fallen: FloatArray  #: fall of ‖e‖² of each motor, shape (m,)
+    fall_by_motor: FloatArray  #: fall of ‖e‖² of each motor, shape (m,)
 
 
 def fit_candidates(
-    folds: Folds, candidates: Iterable[tuple[int, Felt]]
+    folds: Folds, candidates: Iterable[tuple[int, WhitenedColumns]]
 ) -> tuple[CandidateFit | None, ...]:
     """Fit candidates, each given by its number of columns and these.
 
@@ -45,28 +45,28 @@ def fit_candidates(
     contains one already.
     """
 
-    def fit(width: int, batch: Sequence[Felt]) -> Sequence[CandidateFit | None]:
+    def fit(width: int, batch: Sequence[WhitenedColumns]) -> Sequence[CandidateFit | None]:
         return _fitted_together(folds, width, batch)
 
     return in_batches(candidates, fit)
 
 
 def in_batches(
-    candidates: Iterable[tuple[int, Felt]],
-    judge: Callable[[int, Sequence[Felt]], Sequence[Result]],
+    candidates: Iterable[tuple[int, WhitenedColumns]],
+    judge: Callable[[int, Sequence[WhitenedColumns]], Sequence[Result]],
 ) -> tuple[Result, ...]:
     """Judge candidates in batches of equal numbers of columns; the results in their order."""
     results: dict[int, Result] = {}
-    waiting: dict[int, dict[int, Felt]] = {}
+    waiting: dict[int, dict[int, WhitenedColumns]] = {}
 
     def finish(width: int) -> None:
         batch = waiting.pop(width)
         judged = judge(width, list(batch.values()))
         results.update(zip(batch, judged, strict=True))
 
-    for number, (width, felt) in enumerate(candidates):
+    for number, (width, columns) in enumerate(candidates):
         batch = waiting.setdefault(width, {})
-        batch[number] = felt
+        batch[number] = columns
         if len(batch) * width >= BATCH_COLUMNS:
             finish(width)
     for width in tuple(waiting):
@@ -133,19 +133,18 @@ class MotorSums:
         self.score[own.motor, numbers] = score
 
 
-def sums_over_motors(folds: Folds, width: int, candidates: Sequence[Felt]) -> MotorSums:
+def sums_over_motors(folds: Folds, width: int, candidates: Sequence[WhitenedColumns]) -> MotorSums:
     """Sum products of candidates over all rows of each motor, one matrix product a motor."""
     sums = MotorSums.empty(folds, len(candidates), width)
     for own in folds.motors:
-        numbers = felt_by(candidates, own.motor)
+        numbers = candidates_of_motor(candidates, own.motor)
         if not len(numbers):
             continue
-        felt = [candidates[number][own.motor] for number in numbers]
-        columns = np.stack(felt)
+        columns = np.stack([candidates[number][own.motor] for number in numbers])
         flat = columns.reshape(-1, columns.shape[-1])
         equations = own.equations[:-1]  # J and e
         products = flat @ equations.T
-        products = products.reshape(len(felt), width, -1)
+        products = products.reshape(len(numbers), width, -1)
         sums.put(
             own,
             numbers,
@@ -156,9 +155,9 @@ def sums_over_motors(folds: Folds, width: int, candidates: Sequence[Felt]) -> Mo
     return sums
 
 
-def felt_by(candidates: Sequence[Felt], motor: int) -> IntArray:
-    """Which of the candidates a motor feels."""
-    numbers = [number for number, felt in enumerate(candidates) if motor in felt]
+def candidates_of_motor(candidates: Sequence[WhitenedColumns], motor: int) -> IntArray:
+    """Numbers of the candidates that load a motor, ascending, shape (k,)."""
+    numbers = [number for number, columns in enumerate(candidates) if motor in columns]
     return np.array(numbers, dtype=np.int64)
 
 
@@ -176,9 +175,9 @@ class Projection:
         crossed = sums.jacobian.sum(axis=0)
         along = solved(folds.full_factor, crossed)
         hessian = folds.motor_hessian.sum(axis=0)
-        moved = pushed(along, hessian)
-        whole = sums.gram.sum(axis=0)
-        gram = projected_gram(whole, crossed, along, moved)
+        along_hessian = times_hessian(along, hessian)
+        full_gram = sums.gram.sum(axis=0)
+        gram = projected_gram(full_gram, crossed, along, along_hessian)
         declared_score = folds.motor_score.sum(axis=0)
         score = sums.score.sum(axis=0)
         score -= along @ declared_score
@@ -210,9 +209,9 @@ def fall_of_motors(
         along: as of `Projection`.
         coefficients: of each candidate, shape (c, p).
     """
-    score = sums.score - scored_along(along, folds.motor_score)
-    moved = pushed(along, folds.motor_hessian)
-    gram = projected_gram(sums.gram, sums.jacobian, along, moved)
+    score = sums.score - times_score(along, folds.motor_score)
+    along_hessian = times_hessian(along, folds.motor_hessian)
+    gram = projected_gram(sums.gram, sums.jacobian, along, along_hessian)
     linear = np.einsum("ncp,cp->cn", score, coefficients)
     square = np.einsum("cp,ncpq,cq->cn", coefficients, gram, coefficients)
     return np.asarray(2.0 * linear - square)
@@ -238,7 +237,7 @@ def is_new(gram: FloatArray, squares: FloatArray) -> BoolArray:
 
 
 def _fitted_together(
-    folds: Folds, width: int, candidates: Sequence[Felt]
+    folds: Folds, width: int, candidates: Sequence[WhitenedColumns]
 ) -> Sequence[CandidateFit | None]:
     """Fit candidates with the same number of columns."""
     sums = sums_over_motors(folds, width, candidates)
@@ -249,9 +248,9 @@ def _fitted_together(
         return results
     projection = projection.only(new)
     coefficients = projection.coefficients()
-    fallen = fall_of_motors(folds, sums.only(new), projection.along, coefficients)
+    fall_by_motor = fall_of_motors(folds, sums.only(new), projection.along, coefficients)
     for place, number in enumerate(new):
-        results[number] = CandidateFit(coefficients[place], fallen[place])
+        results[number] = CandidateFit(coefficients[place], fall_by_motor[place])
     return results
 
 
@@ -262,7 +261,7 @@ def solved(factor: tuple[FloatArray, bool], right: FloatArray) -> FloatArray:
     return np.asarray(solution.T.reshape(right.shape))
 
 
-def pushed(along: FloatArray, hessian: FloatArray) -> FloatArray:
+def times_hessian(along: FloatArray, hessian: FloatArray) -> FloatArray:
     """w H of each part, shape (…, c, p, f), from w, shape (c, p, f), and H, shape (…, f, f)."""
     flat = along.reshape(-1, along.shape[-1])
     product = flat @ hessian
@@ -270,7 +269,7 @@ def pushed(along: FloatArray, hessian: FloatArray) -> FloatArray:
     return product.reshape(*parts, *along.shape)
 
 
-def scored_along(along: FloatArray, scores: FloatArray) -> FloatArray:
+def times_score(along: FloatArray, scores: FloatArray) -> FloatArray:
     """w s of each part, shape (parts, c, p), from w, shape (c, p, f), and s, shape (parts, f)."""
     flat = along.reshape(-1, along.shape[-1])
     product = scores @ flat.T
@@ -283,7 +282,7 @@ def crossed_gram(first: FloatArray, second: FloatArray) -> FloatArray:
 
 
 def projected_gram(
-    gram: FloatArray, jacobian: FloatArray, along: FloatArray, pushed_along: FloatArray
+    gram: FloatArray, jacobian: FloatArray, along: FloatArray, along_hessian: FloatArray
 ) -> FloatArray:
     """(Φ − J w)ᵀ(Φ − J w) of each part, shape (…, p, p).
 
@@ -291,9 +290,9 @@ def projected_gram(
         gram: ΦᵀΦ, shape (…, p, p).
         jacobian: ΦᵀJ, shape (…, p, f).
         along: wᵀ, same shape.
-        pushed_along: wᵀJᵀJ, same shape.
+        along_hessian: wᵀJᵀJ, same shape.
     """
     crossed = crossed_gram(jacobian, along)
     transposed = np.swapaxes(crossed, -1, -2)
-    of_declared = crossed_gram(pushed_along, along)
+    of_declared = crossed_gram(along_hessian, along)
     return gram - crossed - transposed + of_declared

@@ -2,15 +2,25 @@
 in-sample and on left-out moves.
 
 Friction differs from run to run, as temperature and mounting do. A search that took moves of all
-runs as exchangeable would find laws in that. So `prepare_search` takes the friction of every run as
-drawn around the common one: the rows are decorrelated (`ident.equations.run_scatter`), and trials,
-folds and bootstrap see what a law within the runs explains. The estimate knows nothing of it:
-shifts of gains are those of the estimate (`Folds.estimate_factor`).
+runs as exchangeable would find laws in that. So `prepare_search` gives the friction of each run a
+random deviation from the common one. The rows are decorrelated from it
+(`ident.equations.run_scatter`), and trials, folds and bootstrap see what a law within the runs
+explains. The estimate knows nothing of it: shifts of gains are those of the estimate
+(`Folds.estimate_factor`).
 
 A *candidate* is an effect with one choice of settings on one axis. A *trial* projects its columns
 off all declared directions, gains included, and measures what they explain of the residual:
 in-sample, and on folds of left-out moves. A *family* is one effect with all settings that the
 dictionary tries.
+
+Symbols, of the whitened and decorrelated rows of all motors:
+
+    J    Jacobian of the declared model (`ident.equations.linearisation`), H = JᵀJ
+    e    residual of the estimate, all rows in its fit
+    r    residual of each row by a fit without its fold
+    Φ    columns of a candidate, p of them
+    Φ⊥   Φ − J H⁻¹JᵀΦ, what of them the declared model cannot make
+    G    Φ⊥ᵀΦ⊥, so that the best coefficients are β = G⁻¹ Φ⊥ᵀe
 """
 
 from __future__ import annotations
@@ -27,19 +37,19 @@ from ident.data.conditioning import Conditioning, as_recorded
 from ident.data.dataset import Dataset
 from ident.discovery.candidate_fits import (
     CandidateFit,
-    Felt,
     MotorSums,
     Projection,
+    WhitenedColumns,
+    candidates_of_motor,
     crossed_gram,
     fall_of_motors,
-    felt_by,
     fit_candidates,
     in_batches,
     is_new,
     projected_gram,
-    pushed,
-    scored_along,
     solved,
+    times_hessian,
+    times_score,
 )
 from ident.discovery.few_moves import FEW_MOVES, MoveScores, moves_behind, without_most_leverage
 from ident.discovery.noise_floor import noise_floors
@@ -69,7 +79,9 @@ There are hundreds, and single precision is enough for their trials.
 DECORRELATED_TOGETHER = 16  #: Candidates that are decorrelated at once
 MOVES_WANTED = 60
 SHORTEST_PIECE_S = 0.25
-UNSEEN = 1e-9  #: Share of a direction, squared, below which the folds of a fit do not show it
+#: Singular value of a candidate's Gram matrix in its own units, relative to the largest, at which
+#: the other folds no longer show that combination of its columns
+SMALLEST_SINGULAR = 1e-9
 #: Fields of `Signals` that do not change in a run, or that no effect needs at the rows
 NOT_DECIMATED = frozenset({"rate_hz", "rotor_inertia_kg_m2", "arm", "inertia_kg_m2"})
 FRICTION_OF_A_RUN = 0.03
@@ -92,11 +104,11 @@ class SearchProblem:
     #: Estimate of each motor's noise in a row, which no model of motion explains [A]; None where
     #: not known.
     floors_a: tuple[float | None, ...]
-    #: From the estimate to the best fit where friction differs by run, in the scale of the
-    #: unknowns, shape (f,).
+    #: Step from the estimate to the best fit with friction that differs by run, in the scale of the
+    #: unknowns (`Linearisation.scale`), shape (f,).
     step: FloatArray
-    #: Columns of motion and time alone, which stay the same from turn to turn, before they are
-    #: placed at joints.
+    #: Columns that depend on motion and time alone, before they are placed at joints: they stay
+    #: the same in every turn of a search.
     cache: ColumnCache = field(default_factory=dict)
 
     @property
@@ -116,28 +128,31 @@ class SearchProblem:
         else:
             torque = self.torque
         robot = self.model.robot
-        placed: list[tuple[int, Effect]] = []
+        placed: list[Effect] = []
+        family_of: list[int] = []
         for number, family in enumerate(families):
-            fitting = (effect for effect in family if is_placeable(effect, axis, robot))
-            placed += ((number, effect) for effect in fitting)
-        torques = (torque(effect, axis) for _, effect in placed)
-        trials = self.trials(torques)
+            for effect in family:
+                if is_placeable(effect, axis, robot):
+                    placed.append(effect)
+                    family_of.append(number)
+        # Trials of all families together: candidates of one width share matrix products.
+        trials = self.trials(torque(effect, axis) for effect in placed)
         members: dict[int, list[tuple[Effect, CandidateTrial]]] = {}
-        for (number, effect), trial in zip(placed, trials, strict=True):
+        for number, effect, trial in zip(family_of, placed, trials, strict=True):
             if trial is not None:
                 members.setdefault(number, []).append((effect, trial))
         return tuple(FamilyTrials(axis, tuple(found)) for found in members.values())
 
     def trials(self, torques: Iterable[FloatArray]) -> tuple[CandidateTrial | None, ...]:
         """Test candidates given by joint torques (m, p, r); None where the model contains them."""
-        return _scored(self.folds, self._felt(torques))
+        return _scored(self.folds, self._whitened(torques))
 
     def fits(self, torques: Iterable[FloatArray]) -> tuple[CandidateFit | None, ...]:
         """Fit candidates given by joint torques (m, p, r) to all rows, without folds.
 
         It takes a tenth of the time.
         """
-        return fit_candidates(self.folds, self._felt(torques))
+        return fit_candidates(self.folds, self._whitened(torques))
 
     def fits_at_rows(
         self, effects: Iterable[Effect], axis: int
@@ -155,11 +170,11 @@ class SearchProblem:
                 found.append((effect, fit))
         return found
 
-    def _felt(self, torques: Iterable[FloatArray]) -> Iterator[tuple[int, Felt]]:
+    def _whitened(self, torques: Iterable[FloatArray]) -> Iterator[tuple[int, WhitenedColumns]]:
         """Yield the number of columns of each candidate, and its whitened columns.
 
-        Some are decorrelated at once. One torque after the other is in memory: it is far larger
-        than what single motors feel of it.
+        DECORRELATED_TOGETHER candidates are decorrelated at once. Only one torque, (m, p, r), is in
+        memory at a time: it is far larger than the columns of the motors that it loads.
         """
         problem = self.folds.linearisation
         to_motor = self.model.drive_train.to_motor
@@ -183,15 +198,16 @@ class SearchProblem:
         if isinstance(effect, GeometryEffect):
             # The torque of the whole arm, once more, and it is smooth
             return self.torque_at_rows(effect, axis)
-        kept = self.cache.get((effect, axis))
-        if kept is None:
+        rounded = self.cache.get((effect, axis))
+        if rounded is None:
             columns = effect_columns(
                 effect, axis, self.runs, self.datasets, self.observation.conditioning
             )
-            kept = columns.astype(np.float32)
+            # Rounded also where it is not cached, so that a cache does not change a result.
+            rounded = columns.astype(np.float32)
             if effect.abscissa.is_independent_of_model:
-                self.cache[effect, axis] = kept
-        return at_joints(effect, axis, kept.astype(np.float64), self.model.drive_train)
+                self.cache[effect, axis] = rounded
+        return at_joints(effect, axis, rounded.astype(np.float64), self.model.drive_train)
 
     def torque_at_rows(self, effect: Effect, axis: int) -> FloatArray:
         """Build the same, shape (m, p, r), from signals at the rows.
@@ -201,11 +217,11 @@ class SearchProblem:
         if effect.abscissa in FAST:
             return self.torque(effect, axis)
         conditioning = self.observation.conditioning
-        of_runs: list[FloatArray] = []
+        columns_of_runs: list[FloatArray] = []
         for run in self.rows:
-            columns = columns_at(effect, run, axis)
-            of_runs.append(as_recorded(run.rate_hz, conditioning, columns))
-        columns = np.concatenate(of_runs, axis=-1)
+            own = columns_at(effect, run, axis)
+            columns_of_runs.append(as_recorded(run.rate_hz, conditioning, own))
+        columns = np.concatenate(columns_of_runs, axis=-1)
         return at_joints(effect, axis, columns, self.model.drive_train)
 
 
@@ -217,31 +233,34 @@ class FamilyTrials:
     members: tuple[tuple[Effect, CandidateTrial], ...]  #: settings and their trials, at least one
 
     def nested(self) -> FloatArray:
-        """‖e‖² by fold and motor, shape (folds, m): each fold's setting is chosen by the others."""
+        """‖r‖² by fold and motor, shape (folds, m): each fold's setting is chosen by the others.
+
+        So the score of a family has not seen what it is scored on (nested cross-validation).
+        """
         trials = [trial for _, trial in self.members]
         training_falls = np.stack([trial.training_fall for trial in trials])
-        chosen = np.argmax(training_falls, axis=0)
-        squares = [trials[best].left_out[fold] for fold, best in enumerate(chosen)]
+        best_of_folds = np.argmax(training_falls, axis=0)
+        squares = [trials[best].left_out[fold] for fold, best in enumerate(best_of_folds)]
         return np.stack(squares)
 
 
 @dataclass(frozen=True, slots=True)
 class CandidateTrial:
-    """Result of testing one candidate."""
+    """Result of testing one candidate; symbols as at the top of this module."""
 
-    coefficients: FloatArray  #: in-sample, in the unit of the columns, shape (p,)
-    fallen: FloatArray  #: in-sample fall of ‖e‖² of each motor, shape (m,)
+    coefficients: FloatArray  #: β, in-sample, in the unit of the columns, shape (p,)
+    fall_by_motor: FloatArray  #: in-sample fall of ‖e‖² of each motor, shape (m,)
     #: fall of ‖e‖² on the other folds, by which a setting may be chosen, shape (folds,)
     training_fall: FloatArray
     #: ‖e‖² of each fold and motor with the candidate fitted on the others, shape (folds, m)
     left_out: FloatArray
     score: FloatArray  #: Φ⊥ᵀe, shape (p,)
-    #: Φ⊥ᵀe of each cluster with the candidate fitted: its noise alone, shape (clusters, p)
+    #: X: Φ⊥ᵀ(e − Φ⊥β) of each cluster, its noise alone, shape (clusters, p)
     scatter: FloatArray
-    gram: FloatArray  #: Φ⊥ᵀΦ⊥ of each cluster, shape (clusters, p, p)
-    #: Without the moves of most leverage, of a candidate that rests on few; None of one that rests
-    #: on many.
-    rest: MoveScores | None = None
+    gram: FloatArray  #: Φ⊥ᵀΦ⊥ of each cluster, shape (clusters, p, p); their sum is G
+    #: The candidate without the moves of most leverage, where it rests on few moves; None where it
+    #: rests on many.
+    without_leverage: MoveScores | None = None
 
     @property
     def covariance(self) -> FloatArray:
@@ -259,7 +278,7 @@ class CandidateTrial:
         return np.asarray(np.sqrt(variances))
 
     def _cluster_shares(self) -> FloatArray:
-        """What each cluster adds to the coefficients, X G⁻¹, shape (clusters, p)."""
+        """Share of each cluster's noise in the coefficients, X G⁻¹, shape (clusters, p)."""
         inverse = np.linalg.pinv(self.gram.sum(axis=0))
         return np.asarray(self.scatter @ inverse)
 
@@ -269,14 +288,14 @@ def shares_explained(
 ) -> list[float]:
     """Return the share of the squared residual that each trial explains, of its strongest motor."""
     problem = search_problem.folds.linearisation
-    left = np.bincount(problem.motor, problem.residual**2)
+    squares_by_motor = np.bincount(problem.motor, problem.residual**2)
     shares: list[float] = []
     for trial in trials:
         if trial is None:
             shares.append(0.0)
         else:
-            of_motors = trial.fallen / left
-            shares.append(float(np.max(of_motors)))
+            share_by_motor = trial.fall_by_motor / squares_by_motor
+            shares.append(float(np.max(share_by_motor)))
     return shares
 
 
@@ -332,6 +351,7 @@ def _signals_at_rows(run: Signals, data: Dataset, conditioning: Conditioning) ->
         if one.name in NOT_DECIMATED:
             continue
         array = getattr(run, one.name)
+        # A signal that the run lacks is None, or has no samples.
         if array is not None and array.shape[-1]:
             series[one.name] = decimate_rows(data, conditioning, array)
     time_s = series["time_s"]
@@ -340,6 +360,7 @@ def _signals_at_rows(run: Signals, data: Dataset, conditioning: Conditioning) ->
     arm = run.arm
     if arm is not None:
         states = (data.position_rad, data.velocity_rad_s, data.acceleration_rad_s2)
+        # Samples come first in a dataset, and last in what is decimated.
         decimated = [decimate_rows(data, conditioning, state.T).T for state in states]
         arm = replace(arm, motion=Motion(*decimated))
     return Signals(
@@ -361,16 +382,17 @@ def folds_around(
     Raises:
         TooFewMoves: there are too few moves to leave some out.
     """
-    pieces, move_of = _pieces(observation)
+    piece_of_row, move_of_piece = _pieces(observation)
     problem = linearise(
-        replace(observation, move=pieces),
+        replace(observation, move=piece_of_row),  # its clusters are pieces of moves
         estimate.gains,
         estimate.parameters,
         estimate.axis_noise,
         gains_fixed=estimate.gains_fixed,
     )
-    problem, step = _with_friction_of_runs(problem, model, observation, estimate).fitted()
-    return cut_into_folds(problem, move_of=move_of), step
+    with_friction = _with_friction_of_runs(problem, model, observation, estimate)
+    problem, step = with_friction.fitted()
+    return cut_into_folds(problem, move_of=move_of_piece), step
 
 
 def _with_friction_of_runs(
@@ -385,10 +407,11 @@ def _with_friction_of_runs(
     runs = np.unique(observation.run)
     if len(runs) < 2 or model.is_redundant:
         return problem
-    rubbing = np.flatnonzero(np.isin(observation.base.independent, model.friction_columns))
-    deviation = FRICTION_OF_A_RUN * np.abs(estimate.parameters[rubbing])
-    torque = observation.regressor[:, rubbing] * deviation[:, None]
-    return problem.beside_scatter(torque, model.drive_train.to_motor, observation.run)
+    is_friction = np.isin(observation.base.independent, model.friction_columns)
+    friction = np.flatnonzero(is_friction)
+    deviation = FRICTION_OF_A_RUN * np.abs(estimate.parameters[friction])
+    torque = observation.regressor[:, friction] * deviation[:, None]
+    return problem.decorrelated_from_runs(torque, model.drive_train.to_motor, observation.run)
 
 
 def _pieces(observation: Observation) -> tuple[IntArray, IntArray]:
@@ -399,22 +422,22 @@ def _pieces(observation: Observation) -> tuple[IntArray, IntArray]:
     """
     time_s = observation.time_s
     move = observation.move
-    next_move = np.diff(move, prepend=move[0] - 1) != 0
-    first = np.flatnonzero(next_move)
-    length = np.diff(first, append=len(move))
-    last = first + length - 1
-    total_s = float(np.sum(time_s[last] - time_s[first]))
+    begins_move = np.diff(move, prepend=move[0] - 1) != 0
+    first = np.flatnonzero(begins_move)
+    row_count = np.diff(first, append=len(move))
+    last = first + row_count - 1
+    moving_s = float(np.sum(time_s[last] - time_s[first]))
     if len(first) < MOVES_WANTED:
-        shortest_s = max(SHORTEST_PIECE_S, total_s / MOVES_WANTED)
+        piece_s = max(SHORTEST_PIECE_S, moving_s / MOVES_WANTED)
     else:
-        shortest_s = np.inf
-    since_s = time_s - np.repeat(time_s[first], length)
-    piece = np.floor(since_s / shortest_s).astype(np.int64)
-    next_piece = np.diff(piece, prepend=-1) != 0
-    pieces = np.cumsum(next_move | next_piece).astype(np.int64)
-    used = np.flatnonzero(observation.motor_use.any(axis=0))
-    _, at = np.unique(pieces[used], return_index=True)
-    return pieces, move[used[at]]
+        piece_s = np.inf  # each move is one piece
+    since_begin_s = time_s - np.repeat(time_s[first], row_count)
+    number_in_move = np.floor(since_begin_s / piece_s).astype(np.int64)
+    begins_piece = np.diff(number_in_move, prepend=-1) != 0
+    piece = np.cumsum(begins_move | begins_piece).astype(np.int64)
+    used_rows = np.flatnonzero(observation.motor_use.any(axis=0))
+    _, first_used = np.unique(piece[used_rows], return_index=True)
+    return piece, move[used_rows[first_used]]
 
 
 def score_candidates(
@@ -430,38 +453,38 @@ def score_candidates(
     Returns:
         one trial a candidate; None where the declared model contains it already.
     """
-    whitened: list[tuple[int, Felt]] = []
+    whitened: list[tuple[int, WhitenedColumns]] = []
     for chosen in candidates:
-        part = columns.T[chosen]
-        felt: dict[int, FloatArray] = {}
+        candidate = columns.T[chosen]
+        by_motor: dict[int, FloatArray] = {}
         for own in folds.motors:
-            of_motor = part[:, own.rows]
+            of_motor = candidate[:, own.rows]
             if of_motor.any():
-                felt[own.motor] = of_motor
-        whitened.append((len(part), felt))
+                by_motor[own.motor] = of_motor
+        whitened.append((len(candidate), by_motor))
     return _scored(folds, whitened)
 
 
 def _scored(
-    folds: Folds, candidates: Iterable[tuple[int, Felt]]
+    folds: Folds, candidates: Iterable[tuple[int, WhitenedColumns]]
 ) -> tuple[CandidateTrial | None, ...]:
-    """Test candidates, each given by its number of columns and these."""
+    """Test candidates, each given by its number of columns and the columns of its motors."""
     before = folds.square_sum(folds.residual)
 
-    def score(width: int, batch: Sequence[Felt]) -> Sequence[CandidateTrial | None]:
+    def score(width: int, batch: Sequence[WhitenedColumns]) -> Sequence[CandidateTrial | None]:
         return _scored_together(folds, before, width, batch)
 
     return in_batches(candidates, score)
 
 
 def _scored_together(
-    folds: Folds, before: FloatArray, width: int, candidates: Sequence[Felt]
+    folds: Folds, before: FloatArray, width: int, candidates: Sequence[WhitenedColumns]
 ) -> Sequence[CandidateTrial | None]:
     """Test candidates with the same number of columns p.
 
     Everything is computed from products that are summed block by block, so that no candidate needs
-    a pass over the rows of its own. What the declared model contains already leaves before the sums
-    over moves and folds are made.
+    a pass over the rows of its own. Candidates that the declared model contains already are dropped
+    before the sums over moves and folds are made.
 
     Args:
         folds: the problem.
@@ -469,24 +492,24 @@ def _scored_together(
         width: p.
         candidates: their columns.
     """
-    made: list[_Products] = []
+    of_motors: list[_Products] = []
     for own in folds.motors:
-        numbers = felt_by(candidates, own.motor)
+        numbers = candidates_of_motor(candidates, own.motor)
         if len(numbers):
-            made.append(_products(own, numbers, candidates))
+            of_motors.append(_products(own, numbers, candidates))
     sums = MotorSums.empty(folds, len(candidates), width)
-    for one in made:
-        one.add_to(sums)
+    for products in of_motors:
+        products.add_to(sums)
     projection = Projection.of(folds, sums)
     new = np.flatnonzero(is_new(projection.gram, sums.squares))
     results: list[CandidateTrial | None] = [None] * len(candidates)
     if not len(new):
         return results
     if len(new) < len(candidates):
-        made = [one.only(new) for one in made]
+        of_motors = [products.only(new) for products in of_motors]
         sums = sums.only(new)
         projection = projection.only(new)
-    trials = _tried_on_folds(folds, before, made, sums, projection)
+    trials = _tried_on_folds(folds, before, of_motors, sums, projection)
     for number, trial in zip(new, trials, strict=True):
         results[number] = trial
     return results
@@ -495,7 +518,7 @@ def _scored_together(
 def _tried_on_folds(
     folds: Folds,
     before: FloatArray,
-    made: Sequence[_Products],
+    of_motors: Sequence[_Products],
     sums: MotorSums,
     projection: Projection,
 ) -> tuple[CandidateTrial, ...]:
@@ -503,35 +526,37 @@ def _tried_on_folds(
 
     See `_scored_together` and `_LeftOut`.
     """
-    along = projection.along
-    # Φ⊥ = Φ − J H⁻¹ JᵀΦ, of each cluster.
-    gram = crossed_gram(pushed(along, folds.cluster_hessian), along)
-    cluster_score = -scored_along(along, folds.cluster_score)
-    for one in made:
-        at = np.ix_(one.own.cluster, one.felt)
-        seen_along = along[one.felt][..., one.own.seen]
-        crossed = crossed_gram(one.jacobian, seen_along)
-        gram[at] += one.gram - crossed - np.swapaxes(crossed, -1, -2)
-        cluster_score[at] += one.score
-    # β = G⁻¹ Φ⊥ᵀe, with both summed over clusters; each cluster's scatter is Φ⊥ᵀe − G β.
+    along = projection.along  # w = H⁻¹JᵀΦ, transposed
+    # Of each cluster: Φ⊥ᵀΦ⊥ = wᵀJᵀJ w + ΦᵀΦ − ΦᵀJ w − wᵀJᵀΦ, and Φ⊥ᵀe = Φᵀe − wᵀJᵀe.
+    gram = crossed_gram(times_hessian(along, folds.cluster_hessian), along)
+    cluster_score = -times_score(along, folds.cluster_score)
+    for products in of_motors:
+        own = products.own
+        clusters_of_candidates = np.ix_(own.cluster, products.numbers)
+        seen_along = along[products.numbers][..., own.seen]
+        crossed = crossed_gram(products.jacobian, seen_along)
+        own_gram = products.gram - crossed - np.swapaxes(crossed, -1, -2)
+        gram[clusters_of_candidates] += own_gram
+        cluster_score[clusters_of_candidates] += products.score
+    # β = G⁻¹ Φ⊥ᵀe, with both summed over clusters; each cluster's scatter is Φ⊥ᵀe − Φ⊥ᵀΦ⊥ β.
     score = cluster_score.sum(axis=0)
-    fitted = np.linalg.solve(gram.sum(axis=0), score[..., None])[..., 0]
-    fallen = fall_of_motors(folds, sums, along, fitted)
-    of_fit = (gram @ fitted[..., None])[..., 0]
-    scatter = cluster_score - of_fit
-    left_out = _left_out(folds, before, made, sums)
+    beta = np.linalg.solve(gram.sum(axis=0), score[..., None])[..., 0]
+    fall_by_motor = fall_of_motors(folds, sums, along, beta)
+    fitted_score = (gram @ beta[..., None])[..., 0]
+    scatter = cluster_score - fitted_score
+    left_out = _left_out(folds, before, of_motors, sums)
     trials: list[CandidateTrial] = []
-    for place in range(len(along)):
-        own_gram = gram[:, place]
+    for number in range(len(along)):
+        projected = gram[:, number]
         trial = CandidateTrial(
-            coefficients=fitted[place],
-            fallen=fallen[place],
-            training_fall=left_out.training_fall[:, place],
-            left_out=left_out.squares[:, :, place],
-            score=score[place],
-            scatter=scatter[:, place],
-            gram=own_gram,
-            rest=_rest(folds, made, place, own_gram),
+            coefficients=beta[number],
+            fall_by_motor=fall_by_motor[number],
+            training_fall=left_out.training_fall[:, number],
+            left_out=left_out.squares[:, :, number],
+            score=score[number],
+            scatter=scatter[:, number],
+            gram=projected,
+            without_leverage=_without_leverage(folds, of_motors, number, projected),
         )
         trials.append(trial)
     return tuple(trials)
@@ -539,16 +564,21 @@ def _tried_on_folds(
 
 @dataclass(frozen=True, slots=True)
 class _LeftOut:
-    """Candidates fitted without each fold, beside a model fitted without it."""
+    """Candidates fitted without each fold k, beside a model fitted without it."""
 
     training_fall: FloatArray  #: fall of ‖e‖² on the other folds, shape (folds, c)
-    squares: FloatArray  #: ‖e‖² on the fold, shape (folds, m, c)
+    squares: FloatArray  #: ‖r‖² on the fold, shape (folds, m, c)
 
 
 def _left_out(
-    folds: Folds, before: FloatArray, made: Sequence[_Products], sums: MotorSums
+    folds: Folds, before: FloatArray, of_motors: Sequence[_Products], sums: MotorSums
 ) -> _LeftOut:
-    """Fit candidates with J and Φ of the other folds, for each fold k: Φ − J w_k."""
+    """Fit candidates with J and Φ of the other folds, for each fold k.
+
+    There the declared model takes J w_k of the columns, with w_k = H_k⁻¹ J_kᵀΦ_k of the rows that
+    are not in the fold. What is left of them, Φ − J w_k, is fitted on these rows, and predicts the
+    fold.
+    """
     _, count, width, unknowns = sums.jacobian.shape
     # ΦᵀJ, ΦᵀΦ, Φᵀe and Φᵀr of each fold and motor.
     motors = len(folds.linearisation.gamma)
@@ -556,50 +586,53 @@ def _left_out(
     part_jacobian = np.zeros((*parts, unknowns))
     part_gram = np.zeros((*parts, width))
     part_score = np.zeros(parts)
-    part_left_out = np.zeros(parts)
-    for one in made:
-        own = one.own
-        place = np.s_[:, own.motor, one.felt]
+    part_left_out_score = np.zeros(parts)
+    for products in of_motors:
+        own = products.own
+        numbers = products.numbers
+        motor_of_candidates = np.s_[:, own.motor, numbers]
         # A motor sees some of the unknowns only.
-        jacobian = np.zeros((folds.count, len(one.felt), width, unknowns))
-        jacobian[..., own.seen] = own.by_fold(one.jacobian, folds.count)
-        part_jacobian[place] = jacobian
-        part_gram[place] = own.by_fold(one.gram, folds.count)
-        part_score[place] = own.by_fold(one.score, folds.count)
-        part_left_out[place] = own.by_fold(one.held, folds.count)
+        jacobian = np.zeros((folds.count, len(numbers), width, unknowns))
+        jacobian[..., own.seen] = own.by_fold(products.jacobian, folds.count)
+        part_jacobian[motor_of_candidates] = jacobian
+        part_gram[motor_of_candidates] = own.by_fold(products.gram, folds.count)
+        part_score[motor_of_candidates] = own.by_fold(products.score, folds.count)
+        left_out_score = own.by_fold(products.left_out_score, folds.count)
+        part_left_out_score[motor_of_candidates] = left_out_score
     # Of the other folds: all, less the fold's own part.
-    coupling = sums.jacobian.sum(axis=0) - part_jacobian.sum(axis=1)
-    step_of_folds: list[FloatArray] = []
-    pushed_of_folds: list[FloatArray] = []
-    for factor, own_coupling, hessian in zip(
-        folds.factors, coupling, folds.part_hessian, strict=True
+    other_jacobian = sums.jacobian.sum(axis=0) - part_jacobian.sum(axis=1)
+    along_of_folds: list[FloatArray] = []
+    along_hessian_of_folds: list[FloatArray] = []
+    for factor, jacobian, hessian in zip(
+        folds.factors, other_jacobian, folds.part_hessian, strict=True
     ):
-        step = solved(factor, own_coupling)
-        step_of_folds.append(step)
-        pushed_of_folds.append(pushed(step, hessian))
-    steps = np.stack(step_of_folds)
-    # (Φ − J w_k)ᵀe on the other folds.
-    drive = part_score.sum(axis=(0, 1)) - part_score.sum(axis=1)
-    drive -= (steps @ folds.scores[:, None, :, None])[..., 0]
-    # (Φ − J w_k)ᵀr on the fold, motor by motor.
-    along_jacobian = (steps[:, None] @ folds.part_score[:, :, None, :, None])[..., 0]
-    shown = part_left_out - along_jacobian
-    # What the other folds do not show at all is left as it is: in its own unit, the shortest of all
-    # solutions.
+        along_of_fold = solved(factor, jacobian)
+        along_of_folds.append(along_of_fold)
+        along_hessian_of_folds.append(times_hessian(along_of_fold, hessian))
+    along = np.stack(along_of_folds)  # w_kᵀ, shape (folds, c, p, f)
+    # (Φ − J w_k)ᵀe on the other folds, shape (folds, c, p).
+    other_score = part_score.sum(axis=(0, 1)) - part_score.sum(axis=1)
+    other_score -= (along @ folds.scores[:, None, :, None])[..., 0]
+    # (Φ − J w_k)ᵀr on the fold, motor by motor, shape (folds, m, c, p).
+    declared_score = (along[:, None] @ folds.part_score[:, :, None, :, None])[..., 0]
+    fold_score = part_left_out_score - declared_score
+    # G of the other folds; a combination of columns that they do not show at all gets no
+    # coefficient: in the columns' own units, β_k is the shortest of all solutions.
     unit = np.sqrt(sums.squares)
     other_gram = sums.gram.sum(axis=0) - part_gram.sum(axis=1)
-    schur = other_gram - crossed_gram(coupling, steps)
+    projected = other_gram - crossed_gram(other_jacobian, along)
     units = unit[:, :, None] * unit[:, None, :]
-    inverse = _shortest_inverse(schur / units)
-    in_own_unit = (drive / unit)[..., None]
-    without = (inverse @ in_own_unit)[..., 0] / unit
-    # r − (Φ − J w_k) fitted, squared motor by motor.
-    pushed_steps = np.stack(pushed_of_folds)
-    inside = projected_gram(part_gram, part_jacobian, steps[:, None], pushed_steps)
-    linear = np.einsum("kncp,kcp->knc", shown, without)
+    inverse = _shortest_inverse(projected / units)
+    score_in_own_unit = (other_score / unit)[..., None]
+    beta = (inverse @ score_in_own_unit)[..., 0] / unit
+    # ‖r − (Φ − J w_k) β_k‖² = ‖r‖² − 2 β_kᵀ(Φ − J w_k)ᵀr + β_kᵀ(Φ − J w_k)ᵀ(Φ − J w_k) β_k, of
+    # fold k, motor n and candidate c.
+    along_hessian = np.stack(along_hessian_of_folds)
+    fold_gram = projected_gram(part_gram, part_jacobian, along[:, None], along_hessian)
+    linear = np.einsum("kncp,kcp->knc", fold_score, beta)
     squares = before[:, :, None] - 2.0 * linear
-    squares += np.einsum("kcp,kncpq,kcq->knc", without, inside, without)
-    training_fall = np.sum(drive * without, axis=-1)
+    squares += np.einsum("kcp,kncpq,kcq->knc", beta, fold_gram, beta)
+    training_fall = np.sum(other_score * beta, axis=-1)
     return _LeftOut(training_fall, squares)
 
 
@@ -609,7 +642,7 @@ def _shortest_inverse(matrices: FloatArray) -> FloatArray:
     That of single numbers needs no decomposition.
     """
     if matrices.shape[-1] > 1:
-        return np.asarray(np.linalg.pinv(matrices, rcond=UNSEEN))
+        return np.asarray(np.linalg.pinv(matrices, rcond=SMALLEST_SINGULAR))
     inverse = np.zeros_like(matrices)
     np.divide(1.0, matrices, out=inverse, where=matrices != 0.0)
     return inverse
@@ -617,67 +650,79 @@ def _shortest_inverse(matrices: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class _Products:
-    """Products, block by block, of the candidates that one motor feels with J, Φ, e and r."""
+    """Products, block by block, of the candidates that load one motor with J, Φ, e and r."""
 
     own: MotorRows  #: the motor's rows
-    felt: IntArray  #: these candidates, among those of the batch
+    numbers: IntArray  #: of these candidates, c of them, among those of the batch
     jacobian: FloatArray  #: ΦᵀJ, shape (blocks, c, p, s)
     gram: FloatArray  #: ΦᵀΦ, shape (blocks, c, p, p)
     score: FloatArray  #: Φᵀe, shape (blocks, c, p)
-    held: FloatArray  #: Φᵀr, shape (blocks, c, p)
+    left_out_score: FloatArray  #: Φᵀr, shape (blocks, c, p)
 
     def add_to(self, sums: MotorSums) -> None:
         """Put the sums over all blocks into their places."""
         jacobian = self.jacobian.sum(axis=0)
         gram = self.gram.sum(axis=0)
         score = self.score.sum(axis=0)
-        sums.put(self.own, self.felt, jacobian=jacobian, gram=gram, score=score)
+        sums.put(self.own, self.numbers, jacobian=jacobian, gram=gram, score=score)
 
     def only(self, chosen: IntArray) -> _Products:
-        """The same of some of the candidates of the batch, which are counted anew."""
-        inside = np.flatnonzero(np.isin(self.felt, chosen))
+        """The same of some of the candidates, numbered by their place in ``chosen``."""
+        inside = np.flatnonzero(np.isin(self.numbers, chosen))
         return _Products(
             own=self.own,
-            felt=np.searchsorted(chosen, self.felt[inside]),
+            numbers=np.searchsorted(chosen, self.numbers[inside]),
             jacobian=self.jacobian[:, inside],
             gram=self.gram[:, inside],
             score=self.score[:, inside],
-            held=self.held[:, inside],
+            left_out_score=self.left_out_score[:, inside],
         )
 
 
-def _products(own: MotorRows, numbers: IntArray, candidates: Sequence[Felt]) -> _Products:
-    """Products of those candidates, by number, that a motor feels."""
+def _products(
+    own: MotorRows, numbers: IntArray, candidates: Sequence[WhitenedColumns]
+) -> _Products:
+    """Products of those candidates, by number, that load a motor."""
     columns = np.stack([candidates[number][own.motor] for number in numbers])
     count, width, rows = columns.shape
     flat = own.sums(columns.reshape(-1, rows), own.equations)
-    # The equations of a motor are (J, e, r).
+    # The equations of a motor are J, then e and r (`MotorRows.equations`).
     with_equations = flat.reshape(len(flat), count, width, -1)
     return _Products(
         own=own,
-        felt=numbers,
+        numbers=numbers,
         jacobian=with_equations[..., :-2],
         gram=own.grams(columns),
         score=with_equations[..., -2],
-        held=with_equations[..., -1],
+        left_out_score=with_equations[..., -1],
     )
 
 
-def _rest(
-    folds: Folds, made: Sequence[_Products], place: int, projected: FloatArray
+def _without_leverage(
+    folds: Folds, of_motors: Sequence[_Products], number: int, projected: FloatArray
 ) -> MoveScores | None:
-    """One candidate without the moves of most leverage; None where it rests on many."""
+    """One candidate without the moves of most leverage; None where it rests on many.
+
+    Args:
+        folds: the problem.
+        of_motors: products of all candidates of the batch.
+        number: of the candidate.
+        projected: its Φ⊥ᵀΦ⊥ of each cluster, shape (clusters, p, p).
+    """
     if moves_behind(projected) >= FEW_MOVES:
         return None
     clusters_and_columns = projected.shape[:2]
-    crossed = np.zeros((*clusters_and_columns, folds.linearisation.jacobian.width))
+    unknowns = folds.linearisation.jacobian.width
+    jacobian = np.zeros((*clusters_and_columns, unknowns))
     squares = np.zeros(projected.shape)
     scores = np.zeros(clusters_and_columns)
-    for one in made:
-        for index in np.flatnonzero(one.felt == place):
-            clusters = one.own.cluster
-            jacobian = np.swapaxes(one.jacobian[:, index], 1, 2)
-            crossed[clusters[:, None], :, one.own.seen] += jacobian
-            squares[clusters] += one.gram[:, index]
-            scores[clusters] += one.score[:, index]
-    return without_most_leverage(folds, crossed, squares, scores, projected)
+    for products in of_motors:
+        own = products.own
+        clusters = own.cluster
+        for index in np.flatnonzero(products.numbers == number):
+            # Both index arrays go first: the shape is that of (clusters, s, p).
+            own_jacobian = np.swapaxes(products.jacobian[:, index], 1, 2)
+            jacobian[clusters[:, None], :, own.seen] += own_jacobian
+            squares[clusters] += products.gram[:, index]
+            scores[clusters] += products.score[:, index]
+    return without_most_leverage(folds, jacobian, squares, scores, projected)

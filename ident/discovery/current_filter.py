@@ -32,7 +32,7 @@ from ident.data.conditioning import Conditioning, as_recorded, low_pass, rows_lo
 from ident.discovery.before_after import change_of_squares, squares_left
 from ident.discovery.error_change import ErrorChange
 from ident.discovery.evidence import Evidence
-from ident.discovery.joining import UNFITTED
+from ident.discovery.joining import FIT_ERRORS
 from ident.discovery.late_currents import rough_torque_rates
 from ident.equations.observation import Observation, observe
 from ident.equations.rows import row_masks
@@ -105,7 +105,7 @@ def find_current_filter(evidence: Evidence) -> CurrentFilter | None:
         if chosen is None:
             return None
         return _measured(evidence, chosen)
-    except (*UNFITTED, TooFewMoves):
+    except (*FIT_ERRORS, TooFewMoves):
         return None
 
 
@@ -212,7 +212,7 @@ class _Trials:
         rows = replace(rows, use=self.use, motor_use=self.motor_use)
         try:
             estimate, counts = _estimate(self.evidence, rows)
-        except UNFITTED:
+        except FIT_ERRORS:
             return _Trial(order, cutoff_hz, float("inf"))
         noise = np.maximum(estimate.axis_noise, np.finfo(np.float64).tiny)
         return _Trial(order, cutoff_hz, float(counts @ np.log(noise)))

@@ -17,7 +17,7 @@ from ident.discovery.candidates import ColumnCache, FamilyTrials, score_candidat
 from ident.discovery.evidence import Evidence, with_effects
 from ident.discovery.gates import Gates, impossible, own_unknowns, values_of, without_effects_of
 from ident.discovery.geometry_check import check_geometry
-from ident.discovery.joining import UNFITTED, JointFit, linearised, resettled
+from ident.discovery.joining import FIT_ERRORS, JointFit, linearised, with_refined_settings
 from ident.discovery.loop import Step
 from ident.discovery.rotor_search import declared_forms
 from ident.discovery.search import Finding, rank_families
@@ -60,7 +60,8 @@ def with_declared(
     names = axes or [joint.name for joint in start.model.robot.places]
     for placed in declared:
         joined = _with_declared_form(evidence, declared_forms(placed, evidence.training, names))
-        model = resettled(linearised(replace(joined, declared=len(joined.effects)), cache))
+        joined = replace(joined, declared=len(joined.effects))
+        model = with_refined_settings(linearised(joined, cache))
         evidence = model.evidence
         finding = _finding_beside_others(model, evidence.effects[-1], rng, gates)
         if finding is None:
@@ -111,7 +112,7 @@ def _is_geometry_to_blame(
     corrections = tuple(found.placed for found in mistakes)
     try:
         corrected = with_effects(evidence, (*evidence.effects, *corrections))
-    except UNFITTED:
+    except FIT_ERRORS:
         return False
     return not impossible_declared(replace(corrected, declared=evidence.declared), axes)
 
@@ -124,7 +125,7 @@ def _with_declared_form(evidence: Evidence, forms: Sequence[PlacedEffect]) -> Ev
     for form in richer:
         try:
             return with_effects(evidence, (*evidence.effects, form))
-        except UNFITTED:
+        except FIT_ERRORS:
             continue
     return with_effects(evidence, (*evidence.effects, plain))
 

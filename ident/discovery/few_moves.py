@@ -143,25 +143,27 @@ def without_most_leverage(
     return MoveScores(score.sum(axis=0), scatter_of_all, gram_of_all)
 
 
-def is_tested_on_others(rest: MoveScores | None) -> bool:
+def is_tested_on_others(without_leverage: MoveScores | None) -> bool:
     """Whether a candidate that rests on few moves rests on enough others to be tested by these."""
-    return rest is not None and moves_behind(rest.gram) >= FEW_MOVES
+    if without_leverage is None:
+        return False
+    return moves_behind(without_leverage.gram) >= FEW_MOVES
 
 
-def what_to_record(effect: Effect, gram: FloatArray, rest: MoveScores | None) -> str:
+def what_to_record(effect: Effect, gram: FloatArray, without_leverage: MoveScores | None) -> str:
     """Say that a candidate rests on too few moves to be believed, and what to record.
 
     Args:
         effect: of the candidate.
         gram: Φ⊥ᵀΦ⊥ of each cluster, shape (clusters, p, p).
-        rest: the candidate without the moves of most leverage.
+        without_leverage: the candidate without the moves of most leverage.
     """
     count = max(round(moves_behind(gram)), 1)
     if count == 1:
         moves = "one move"
     else:
         moves = f"{NUMBERS[count]} moves"
-    if is_tested_on_others(rest):
+    if is_tested_on_others(without_leverage):
         why = "and the others do not show it"
     else:
         why = "too few to test it"

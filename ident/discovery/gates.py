@@ -22,7 +22,7 @@ import scipy  # loads scipy.special when it is first used: a fit needs none of i
 from scipy import linalg
 
 from ident.arrays import BoolArray, FloatArray, IntArray, require_count, require_number
-from ident.discovery.candidates import UNSEEN, SearchProblem
+from ident.discovery.candidates import SMALLEST_SINGULAR, SearchProblem
 from ident.discovery.error_change import ErrorChange, change_of_errors
 from ident.effects.effect import Effect, PlacedEffect
 from ident.equations.linearisation import RIDGE, Folds, cut_into_folds, sum_of_squares
@@ -337,7 +337,7 @@ class PartsLeftOut:
             along = linalg.cho_solve(fit.factor, rest.T).T
             left = gram_of_all - grams[part] - rest @ along.T
             drive = scores.sum(axis=0) - scores[part] - along @ fit.score
-            inverse = np.linalg.pinv(left / units, rcond=UNSEEN)
+            inverse = np.linalg.pinv(left / units, rcond=SMALLEST_SINGULAR)
             coefficients[part] = inverse @ (drive / unit) / unit
             steps[part, 0] = linalg.cho_solve(fit.factor, fit.score)
             steps[part, 1] = coefficients[part] @ along
@@ -419,6 +419,12 @@ def values_of(estimate: Estimate, own: IntArray) -> FloatArray:
     """Values of some parameters with what was applied to the robot's description, shape (p,)."""
     applied = np.array([estimate.unknowns[index].about for index in own])
     return np.asarray(estimate.parameters[own] + applied)
+
+
+def covariance_of(estimate: Estimate, own: IntArray) -> FloatArray:
+    """Covariance of some parameters, shape (p, p); gains come before them in that of all."""
+    index = len(estimate.gains) + own
+    return estimate.covariance[np.ix_(index, index)]
 
 
 def without_effects_of(

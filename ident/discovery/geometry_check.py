@@ -3,10 +3,11 @@ without a search, correcting nothing.
 
 Zeros of joints, the direction of gravity, late positions and late currents are tested on the rows
 of a fit (`ident.effects.geometry_corrections`, `ident.discovery.late_currents`). Where one of them
-passes, it must also explain more of what is left out than each named effect of one axis does, or
-most of it beside the best of these: a spring that the model lacks explains a part of what a wrong
-zero does, and friction that it lacks on another axis does not. What is left is fitted together with
-everything else, and must pass by the σ of that fit, which is the one that is reported.
+passes, it must also lower the error on left-out moves more than every named effect of one axis; or,
+with the best of these effects in the model, it must still explain most of what it does alone. A
+spring that the model lacks explains a part of what a wrong zero does; friction that it lacks on
+another axis does not. What is left is fitted together with everything else, and must pass by the σ
+of that fit, which is the one that is reported.
 
 Two zeros that are wrong at once bend each other's numbers: alone, one of them takes over a part of
 the other. So the test is repeated beside what it has found until it finds nothing more, and all
@@ -26,8 +27,15 @@ from ident.arrays import FloatArray
 from ident.discovery.alike_corrections import alike_corrections, axes_to_move, explains_beside
 from ident.discovery.candidates import FamilyTrials, SearchProblem, folds_around
 from ident.discovery.evidence import Evidence, coefficients_of, with_effects
-from ident.discovery.gates import Gates, certain_delays, impossible, in_noise, own_unknowns
-from ident.discovery.joining import SHOWN, UNFITTED, refuted_by_instruments
+from ident.discovery.gates import (
+    Gates,
+    certain_delays,
+    covariance_of,
+    impossible,
+    in_noise,
+    own_unknowns,
+)
+from ident.discovery.joining import FIT_ERRORS, INSTRUMENT_CONFIDENCE, refuted_by_instruments
 from ident.discovery.late_currents import (
     Delay,
     find_late_currents,
@@ -70,21 +78,24 @@ AT_ROWS = frozenset(
 """Variables of the effects that a correction competes with:
 they change slowly enough to be built at the rows.
 """
-CLOCK = (Lag, TimeSkew, LatePosition)  #: Effects of what is not recorded at one moment
-#: Largest σ, 0.4°, by which a zero that is wrong by 2° is named; usual are some hundredths
-SEEN_ZERO_RAD = 0.007
-SEEN_ZERO_M = 0.0012  #: The same of a slide that is wrong by 6 mm
-LEAST_DELAY_S = 5e-4  #: Of currents, that is named: less is a filter of the drive
+CLOCK = (Lag, TimeSkew, LatePosition)  #: Effects of signals that are recorded at different times
+LARGEST_ZERO_STD_RAD = 0.007
+"""Largest σ with which a zero that is wrong by 2° is still named, 0.4°;
+usual are some hundredths of a degree.
+"""
+LARGEST_ZERO_STD_M = 0.0012  #: The same of a slide whose zero is wrong by 6 mm
+LEAST_DELAY_S = 5e-4  #: Shortest delay of a current that is named: less is a filter of the drive
 LEAST_EARLY_SHARE = Gates().smallest_share
-"""Share of its motor's squared residual that a current which is early by itself explains;
-as any effect of a search.
+"""Share of its motor's squared residual that must be explained by the current of one axis alone
+that is early; it is that of any effect of a search.
 """
 MOST_ROUNDS = 4  #: Tests one after the other, each beside the mistakes that were found before
 LEAST_SETTLED_STD = 0.1
-"""Least σ of a correction in the joint fit, in that of its column.
+"""Least σ of a correction in the joint fit, relative to the σ of its column to first order.
 
-Where gravity leans and a joint hardly moves, a base parameter of the corrected robot is the same
-column as the turn itself, and leaves it a σ of rounding errors.
+Where gravity leans and a joint hardly moves, a base parameter of the corrected robot has the same
+column as the correction. The fit then puts the correction into that parameter, and the σ that it
+gives the correction itself is one of rounding errors.
 """
 
 
@@ -141,13 +152,13 @@ class GeometryCheck:
 
 @dataclass(frozen=True, slots=True)
 class _Round:
-    """One test beside what earlier tests have found."""
+    """One test with the mistakes that earlier tests have found in the model."""
 
-    evidence: Evidence  #: beside which it was made
+    evidence: Evidence  #: the fit that it was made on
     problem: SearchProblem
     findings: tuple[Finding, ...]  #: of all corrections, the best first
-    pairs: tuple[PairOfZeros, ...]  #: of zeros that each alone would be seen
-    settled: _Settled | None  #: what it has found
+    pairs: tuple[PairOfZeros, ...]  #: of zeros, each of which the data show by itself
+    settled: _Settled | None  #: what it has found; None for nothing
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,17 +173,16 @@ class _Settled:
 class _Suspect:
     """A mistake that may explain the residual, to first order."""
 
-    effects: tuple[PlacedEffect, ...]
-    torque_nm: FloatArray  #: their columns at the joints, shape (m, p, r)
+    effects: tuple[PlacedEffect, ...]  #: one; two zeros; or the delays of several currents
+    torque_nm: FloatArray  #: their columns as joint torque per unit coefficient, shape (m, p, r)
     values: FloatArray  #: their coefficients, shape (p,)
     left_out_fall: float  #: fall of the whitened ‖e‖² on left-out moves
 
     @classmethod
     def of_pair(cls, problem: SearchProblem, pair: PairOfZeros) -> _Suspect:
-        """Two zeros."""
-        return cls(
-            pair.effects, pair.torque_nm, pair.trial.coefficients, float(pair.fall(problem).sum())
-        )
+        """The suspicion that both zeros of a pair are wrong."""
+        fall = float(pair.fall(problem).sum())
+        return cls(pair.effects, pair.torque_nm, pair.trial.coefficients, fall)
 
     @property
     def is_pair(self) -> bool:
@@ -193,21 +203,27 @@ class _Suspect:
 class _Rivals:
     """What suspects compete with."""
 
-    findings: tuple[Finding, ...]  #: the best on left-out moves first
-    at_full_rate: dict[PlacedEffect, FloatArray]  #: columns of those that are not built at the rows
+    #: of all effects, the suspects too; the best on left-out moves first
+    findings: tuple[Finding, ...]
+    #: columns (m, p, r) of the fast effects, which cannot be built at the rows
+    at_full_rate: dict[PlacedEffect, FloatArray]
 
     def findings_of(self, effects: Sequence[PlacedEffect]) -> tuple[Finding, ...]:
         """Findings of some effects, in their order."""
-        by_place = {(found.effect.name, found.axis): found for found in self.findings}
-        return tuple(by_place[placed.effect.name, placed.axis] for placed in effects)
+        by_family = {(found.effect.name, found.axis): found for found in self.findings}
+        return tuple(by_family[placed.effect.name, placed.axis] for placed in effects)
 
     def others(self, suspect: _Suspect) -> list[Finding]:
-        """Findings of all others, and for late currents of no delay of currents."""
+        """Findings that a suspect competes with, the best first.
+
+        Delays of currents do not compete with each other: they were fitted together.
+        """
         own = {(placed.effect.name, placed.axis) for placed in suspect.effects}
         others: list[Finding] = []
         for found in self.findings:
-            is_of_currents = suspect.is_of_currents and isinstance(found.effect, Delay)
-            if (found.effect.name, found.axis) not in own and not is_of_currents:
+            is_own = (found.effect.name, found.axis) in own
+            is_fellow_delay = suspect.is_of_currents and isinstance(found.effect, Delay)
+            if not is_own and not is_fellow_delay:
                 others.append(found)
         return others
 
@@ -217,12 +233,8 @@ class _Rivals:
             return False
         for found in self.findings:
             is_fast = found.placed in self.at_full_rate
-            if (
-                is_fast
-                and found.passed
-                and _is_of_axis(found, delay)
-                and found.left_out_fall > delay.left_out_fall
-            ):
+            is_rival = is_fast and found.passed and _is_of_axis(found, delay)
+            if is_rival and found.left_out_fall > delay.left_out_fall:
                 return True
         return False
 
@@ -254,7 +266,8 @@ def check_geometry(
         EffectRefused: an effect of another package cannot be used.
     """
     families = search_families(own_effects)
-    # What the arm does wrong is spread over all motors, and a delay is judged by its length.
+    # No share of one motor's residual is asked for: a wrong zero is spread over all motors, and a
+    # delay is judged by its length.
     gates = replace(gates or Gates(), explained=0.0, error_fall=0.0)
     first = _tested_once(evidence, families, rng, gates)
     rounds = [first]
@@ -264,7 +277,7 @@ def check_geometry(
             break
         try:
             rounds.append(_tested_once(settled.corrected, families, rng, gates))
-        except TooFewMoves:  # of the corrected description, other moves may be valid
+        except TooFewMoves:  # which moves are valid depends on the corrected description
             break
     mistakes = _in_one_fit(rounds)
     robot = evidence.model.robot
@@ -286,38 +299,42 @@ def _tested_once(
         TooFewMoves: there are too few moves to leave some out.
     """
     problem = _problem_at_rows(evidence)
-    of_geometry = _not_late_yet(_tested(problem, GEOMETRY), evidence)
-    of_currents = _not_late_yet(try_delays(problem, rough_torque_rates(evidence)), evidence)
-    screened = rank_families(problem, (*of_geometry, *of_currents), rng, gates)
+    of_geometry = _without_second_delays(_tested(problem, GEOMETRY), evidence)
+    # First with rates of torque that are rough but quick: where nothing passes, the test is over.
+    rough_delays = try_delays(problem, rough_torque_rates(evidence))
+    rough_delays = _without_second_delays(rough_delays, evidence)
+    screened = rank_families(problem, (*of_geometry, *rough_delays), rng, gates)
     hidden = _hidden_zeros(screened, problem.model.robot)
     pairs = try_pairs(problem, [family for family in of_geometry if family.axis not in hidden])
     wrong_pairs = pairs_that_pass(problem, pairs, rng, gates)
     if not wrong_pairs and not any(found.passed for found in screened):
         return _Round(evidence, problem, screened, pairs, None)
     rates_nm_s = torque_rates(evidence)
-    of_currents = _not_late_yet(try_delays(problem, rates_nm_s), evidence)
-    tested = (*of_geometry, *of_currents)
+    delays = _without_second_delays(try_delays(problem, rates_nm_s), evidence)
+    tested = (*of_geometry, *delays)
     findings = rank_families(problem, tested, rng, gates)
-    suspects = _suspects(problem, findings, of_currents, rates_nm_s)
+    suspects = _suspects(problem, findings, delays, rates_nm_s)
     of_pairs = tuple(_Suspect.of_pair(problem, pair) for pair in wrong_pairs)
     rivals = _rivals(evidence, problem, families, tested, (*suspects, *of_pairs), rng, gates)
-    # A pair explains more than one zero does, whether it is needed or not.
+    # Pairs come second: two zeros always explain more than one, also where one is enough.
     settled = _first_that_stands(evidence, problem, suspects, rivals)
     if settled is None:
         settled = _first_that_stands(evidence, problem, of_pairs, rivals)
     return _Round(evidence, problem, findings, pairs, settled)
 
 
-def _not_late_yet(tested: Sequence[FamilyTrials], evidence: Evidence) -> tuple[FamilyTrials, ...]:
-    """Trials without delays of what the model has a delay of:
+def _without_second_delays(
+    tested: Sequence[FamilyTrials], evidence: Evidence
+) -> tuple[FamilyTrials, ...]:
+    """Trials without those of delays of signals that have a delay in the model already:
     a second one would only mend the form of the first.
     """
-    left: list[FamilyTrials] = []
+    others: list[FamilyTrials] = []
     for family in tested:
         effect, _ = family.members[0]
         if not _is_second_delay(PlacedEffect(effect, family.axis), evidence):
-            left.append(family)
-    return tuple(left)
+            others.append(family)
+    return tuple(others)
 
 
 def _is_second_delay(placed: PlacedEffect, evidence: Evidence) -> bool:
@@ -331,22 +348,23 @@ def _is_second_delay(placed: PlacedEffect, evidence: Evidence) -> bool:
 
 
 def _in_one_fit(rounds: Sequence[_Round]) -> tuple[Finding, ...]:
-    """The mistakes of all rounds with values and σ of the fit that has all of them;
-    those that it shows.
+    """Mistakes of all rounds that are not zero by the fit that corrects all of them,
+    with values and σ of this fit.
     """
     settled = [one.settled for one in rounds if one.settled is not None]
     if not settled:
         return ()
     if len(settled) == 1:
         return settled[0].mistakes
-    fitted = settled[-1].corrected
-    shown: list[Finding] = []
+    estimate = settled[-1].corrected.estimate
+    mistakes: list[Finding] = []
     for found in chain.from_iterable(one.mistakes for one in settled):
-        values, deviations = coefficients_of(fitted.estimate, found.placed)
+        values, deviations = coefficients_of(estimate, found.placed)
+        covariance = _covariance_of(estimate, found.placed)
         # What an earlier round found may have been a part of what a later one found.
-        if not in_noise(values, _covariance_of(fitted.estimate, found.placed), SHOWN):
-            shown.append(replace(found, coefficients=values, deviations=deviations))
-    return tuple(shown)
+        if not in_noise(values, covariance, INSTRUMENT_CONFIDENCE):
+            mistakes.append(replace(found, coefficients=values, deviations=deviations))
+    return tuple(mistakes)
 
 
 def _all_alike(
@@ -364,18 +382,17 @@ def _all_alike(
         if not isinstance(mistake.effect, GeometryEffect):
             continue
         others = tuple(one.placed for one in mistakes if one is not mistake)
-        beside = _round_beside(rounds, evidence, others)
-        if beside is None:
+        beside_others = _round_beside(rounds, evidence, others)
+        if beside_others is None:
             try:
-                beside = _ranked_beside(evidence, others, rng, gates)
-            # Of the corrected description, other moves may be valid.
-            except (*UNFITTED, TooFewMoves):
+                beside_others = _ranked_beside(evidence, others, rng, gates)
+            # TooFewMoves: which moves are valid depends on the corrected description.
+            except (*FIT_ERRORS, TooFewMoves):
                 continue
-        alike = _alike(beside, mistake)
+        alike = _alike(beside_others, mistake)
         if alike:
-            axes = axes_to_move(
-                [one.placed for one in alike], evidence.model.robot, evidence.fit_runs
-            )
+            placed = [one.placed for one in alike]
+            axes = axes_to_move(placed, evidence.model.robot, evidence.fit_runs)
             found.append(AlikeCorrections(alike, axes))
     return tuple(found)
 
@@ -383,7 +400,7 @@ def _all_alike(
 def _round_beside(
     rounds: Sequence[_Round], evidence: Evidence, others: Sequence[PlacedEffect]
 ) -> _Round | None:
-    """The round that was made beside some mistakes and nothing else; None where there was none."""
+    """The round with some mistakes and no others in its model; None where there was none."""
     effects = {*evidence.effects, *others}
     return next((one for one in rounds if set(one.evidence.effects) == effects), None)
 
@@ -391,7 +408,7 @@ def _round_beside(
 def _ranked_beside(
     evidence: Evidence, others: tuple[PlacedEffect, ...], rng: np.random.Generator, gates: Gates
 ) -> _Round:
-    """All corrections ranked beside some mistakes.
+    """All corrections ranked with some mistakes in the model.
 
     Raises:
         NotConverged, RankDeficient: see `ident.identify`.
@@ -408,12 +425,12 @@ def _alike(beside: _Round, mistake: Finding) -> tuple[Finding, ...]:
     empty where it stands alone.
     """
     corrections = [found for found in beside.findings if isinstance(found.effect, GeometryEffect)]
-    # As it was ranked among the corrections: its ambiguity names those that folds do not
-    # distinguish from it.
-    as_found = next((one for one in corrections if one.placed == mistake.placed), None)
-    if as_found is None:
+    # As ranked in this round: its ambiguity names the corrections that folds do not distinguish
+    # from it.
+    ranked = next((one for one in corrections if one.placed == mistake.placed), None)
+    if ranked is None:
         return ()
-    others = alike_corrections(beside.problem, as_found, corrections)
+    others = alike_corrections(beside.problem, ranked, corrections)
     if not others:
         return ()
     alike = [mistake]
@@ -421,7 +438,10 @@ def _alike(beside: _Round, mistake: Finding) -> tuple[Finding, ...]:
         torque_nm = beside.problem.torque_at_rows(other.effect, other.axis)
         suspect = _Suspect((other.placed,), torque_nm, other.coefficients, other.left_out_fall)
         settled = _settled(beside.evidence, suspect, (other,))
-        alike.append(other if settled is None else settled.mistakes[0])
+        if settled is None:
+            alike.append(other)
+        else:
+            alike.append(settled.mistakes[0])
     return tuple(alike)
 
 
@@ -433,8 +453,9 @@ def _suspects(
 ) -> tuple[_Suspect, ...]:
     """The mistakes that pass, the best on left-out moves first.
 
-    Late currents are one suspect, whichever of them pass. They are one as well where a late
-    position does alone: the delays of several currents, of which none passes alone, look like it.
+    Late currents are one suspect, whichever of them pass. They are a suspect also where a late
+    position passes and no late current does: the delays of several currents, none of which passes
+    alone, look like a late position.
     """
     suspects: list[_Suspect] = []
     passed = [found for found in findings if found.passed]
@@ -471,23 +492,21 @@ def _rivals(
     a gap or a spring in it.
     """
     slow = (*tested, *_tested(problem, _slow(families)))
-    late: set[int] = set()
+    late_axes: set[int] = set()
     for suspect in suspects:
-        late |= {
-            one.axis
-            for one in suspect.effects
-            if isinstance(one.effect, CLOCK) and one.effect.has_axis
-        }
-    if late:
-        at_full_rate = _columns_at_full_rate(evidence, families, sorted(late))
-    else:
-        at_full_rate = {}
-    of_fast = problem.trials(at_full_rate.values())
+        for placed in suspect.effects:
+            if isinstance(placed.effect, CLOCK) and placed.effect.has_axis:
+                late_axes.add(placed.axis)
+    at_full_rate: dict[PlacedEffect, FloatArray] = {}
+    if late_axes:
+        at_full_rate = _columns_at_full_rate(evidence, families, sorted(late_axes))
+    trials = problem.trials(at_full_rate.values())
     fast: list[FamilyTrials] = []
-    for placed, trial in zip(at_full_rate, of_fast, strict=True):
+    for placed, trial in zip(at_full_rate, trials, strict=True):
         if trial is not None:
             fast.append(FamilyTrials(placed.axis, ((placed.effect, trial),)))
-    return _Rivals(rank_families(problem, (*slow, *fast), rng, gates), at_full_rate)
+    findings = rank_families(problem, (*slow, *fast), rng, gates)
+    return _Rivals(findings, at_full_rate)
 
 
 def _first_that_stands(
@@ -498,6 +517,7 @@ def _first_that_stands(
     """
     for suspect in suspects:
         own = rivals.findings_of(suspect.effects)
+        # It passed among the corrections; among all rivals it must pass again.
         if not suspect.is_pair and not any(found.passed for found in own):
             continue
         best = suspects[0]
@@ -514,12 +534,11 @@ def _first_that_stands(
 def _stands_beside(
     problem: SearchProblem, suspect: _Suspect, own: Sequence[Finding], rivals: _Rivals
 ) -> bool:
-    """Whether a suspect explains more than every rival, or most of it beside the best.
+    """Whether a suspect explains more than every rival, or most of that with the best one fitted.
 
-    A late current must do so beside the effects of its own axis, too. Delays of currents do not
-    compete with each other: they were fitted together. A spring or a gap in a gear explains a part
-    of what a delay does, and more: where one passes and explains more than a delay of its axis, the
-    delay is not named before that effect is in the model.
+    The delay of each late current must stand in this way beside the effects of its own axis, too. A
+    spring or a gap in a gear explains what a delay does, and more: where one passes and explains
+    more than a delay of its axis, the delay is not named before that effect is in the model.
 
     Args:
         problem: around the fit.
@@ -536,32 +555,31 @@ def _stands_beside(
         return False
     if not suspect.is_of_currents:
         return True
-    for index, found in enumerate(own):
-        of_axis = [other for other in others if _is_of_axis(other, found)]
-        if of_axis and of_axis[0].left_out_fall > found.left_out_fall:
-            alone = replace(
-                suspect, torque_nm=suspect.torque_nm[:, [index]], left_out_fall=found.left_out_fall
-            )
-            if not alone.explains_beside(problem, rivals.torque_nm(problem, of_axis[0])):
-                return False
+    for index, delay in enumerate(own):
+        of_axis = [other for other in others if _is_of_axis(other, delay)]
+        if not of_axis or of_axis[0].left_out_fall <= delay.left_out_fall:
+            continue
+        column_nm = suspect.torque_nm[:, [index]]
+        rival_nm = rivals.torque_nm(problem, of_axis[0])
+        if not explains_beside(problem, column_nm, delay.left_out_fall, rival_nm):
+            return False
     return True
 
 
 def _is_of_axis(other: Finding, found: Finding) -> bool:
-    """Whether a finding is an effect of the axis of another one,
-    and corrects nothing of the whole arm.
-    """
+    """Whether a finding is an effect on the axis of another one, and no correction of the arm."""
     is_same = found.effect.has_axis and other.axis == found.axis
     return is_same and not isinstance(other.effect, GeometryEffect)
 
 
 def _settled(evidence: Evidence, suspect: _Suspect, own: Sequence[Finding]) -> _Settled | None:
-    """A suspect with values and σ of a fit with it, corrected until nothing is left to correct;
-    None where it falls.
+    """A suspect with values and σ of a fit with it in the model; None where it does not stand.
 
-    Its column is for small mistakes. The fit must show it by its own σ, within what is possible;
-    and instruments from the demanded motion must not show that a disturbance in the position loop
-    looks like it. A mistake without such a fit has no size that could be reported.
+    A column is linear in the mistake, and so exact for a small one only: the fit corrects the
+    robot, builds the column again, and repeats this until nothing is left to correct. By the σ of
+    that fit, the mistake must not be zero, and it must be possible; and instruments from the
+    demanded motion must not show that a disturbance in the position loop looks like it. A mistake
+    without such a fit has no size that could be reported.
 
     Args:
         evidence: without it.
@@ -573,31 +591,34 @@ def _settled(evidence: Evidence, suspect: _Suspect, own: Sequence[Finding]) -> _
             corrected = with_delays(evidence, suspect.effects, suspect.values)
         else:
             corrected = with_effects(evidence, (*evidence.effects, *suspect.effects))
-    except UNFITTED:
+    except FIT_ERRORS:
         return None
     estimate = corrected.estimate
-    shown: list[Finding] = []
-    for found, placed in zip(own, corrected.effects[-len(own) :], strict=True):
+    mistakes: list[Finding] = []
+    added = corrected.effects[-len(own) :]  # the suspect's, behind those of the model
+    for found, placed in zip(own, added, strict=True):
         values, deviations = coefficients_of(estimate, placed)
         covariance = _covariance_of(estimate, placed)
         settled = replace(found, effect=placed.effect, coefficients=values, deviations=deviations)
         if np.any(deviations < LEAST_SETTLED_STD * found.deviations):
-            # The fit has lost the correction in a parameter of the corrected robot: the linear
-            # values stay.
+            # A parameter of the corrected robot has taken the correction up (LEAST_SETTLED_STD):
+            # the values to first order stay.
             settled = found
             covariance = np.diag(found.deviations**2)
         if impossible(settled.effect.coefficients, settled.coefficients, settled.deviations):
             continue
         if suspect.is_of_currents and _is_unlikely_delay(settled):
             continue
-        if in_noise(settled.coefficients, covariance, SHOWN):
+        if in_noise(settled.coefficients, covariance, INSTRUMENT_CONFIDENCE):
             continue
         if isinstance(placed.effect, CLOCK) and refuted_by_instruments(corrected, placed):
             continue
-        shown.append(settled)
-    if suspect.is_pair and len(shown) < len(own):
-        return None  # the other zero alone has not passed
-    return _Settled(tuple(shown), corrected) if shown else None
+        mistakes.append(settled)
+    # Of a pair both must stand: one zero alone had its own test, and did not pass.
+    is_half_a_pair = suspect.is_pair and len(mistakes) < len(own)
+    if not mistakes or is_half_a_pair:
+        return None
+    return _Settled(tuple(mistakes), corrected)
 
 
 def _is_unlikely_delay(found: Finding) -> bool:
@@ -616,8 +637,7 @@ def _is_unlikely_delay(found: Finding) -> bool:
 
 def _covariance_of(estimate: Estimate, placed: PlacedEffect) -> FloatArray:
     """Covariance of the coefficients of an effect in a fit, shape (p, p)."""
-    place = len(estimate.gains) + own_unknowns(estimate, (placed,))
-    return estimate.covariance[np.ix_(place, place)]
+    return covariance_of(estimate, own_unknowns(estimate, (placed,)))
 
 
 def _gravity(evidence: Evidence, problem: SearchProblem) -> Gravity | None:
@@ -632,34 +652,40 @@ def _gravity(evidence: Evidence, problem: SearchProblem) -> Gravity | None:
     training = evidence.training.extended(placed.columns, torque_nm)
     try:
         estimate = estimate_with(Method.ML, training.system(), evidence.estimate.fixed_gains)
-    except UNFITTED:
+    except FIT_ERRORS:
         return None
     declared_m_s2 = evidence.model.robot.gravity_m_s2
     turn, _ = coefficients_of(estimate, placed)
     angle = float(np.linalg.norm(turn))
-    # σ along the turn that was found; of no turn at all, any.
-    along = turn / angle if angle > 0.0 else np.array([1.0, 0.0])
+    # σ is that along the turn that was found; any direction will do for no turn at all.
+    direction = np.array([1.0, 0.0])
+    if angle > 0.0:
+        direction = turn / angle
     covariance_rad2 = _covariance_of(estimate, placed)
     return Gravity(
         declared_m_s2=declared_m_s2,
         found_m_s2=turned_gravity(declared_m_s2, turn.tolist()),
         turn_rad=angle,
-        turn_std_rad=float(np.sqrt(along @ covariance_rad2 @ along)),
+        turn_std_rad=float(np.sqrt(direction @ covariance_rad2 @ direction)),
         covariance_rad2=covariance_rad2,
     )
 
 
 def _hidden_zeros(findings: Sequence[Finding], robot: Robot) -> tuple[int, ...]:
     """Axes whose zero could be wrong by 2°, or 6 mm, without being named."""
-    std_of = {
-        found.axis: float(found.deviations[0])
-        for found in findings
-        if isinstance(found.effect, ZeroOffset)
-    }
-    placeable = [
-        axis for axis in range(robot.axis_count) if is_placeable(ZeroOffset(), axis, robot)
-    ]
-    return tuple(axis for axis in placeable if std_of.get(axis, np.inf) > _seen_std(robot, axis))
+    std_of_axis: dict[int, float] = {}
+    for found in findings:
+        if isinstance(found.effect, ZeroOffset):
+            std_of_axis[found.axis] = float(found.deviations[0])
+    hidden: list[int] = []
+    for axis in range(robot.axis_count):
+        if not is_placeable(ZeroOffset(), axis, robot):
+            continue
+        # Without a finding the declared model makes the same torques.
+        std = std_of_axis.get(axis, np.inf)
+        if std > _largest_zero_std(robot, axis):
+            hidden.append(axis)
+    return tuple(hidden)
 
 
 def _hidden_pairs(pairs: Sequence[PairOfZeros], robot: Robot) -> tuple[tuple[int, int], ...]:
@@ -668,17 +694,17 @@ def _hidden_pairs(pairs: Sequence[PairOfZeros], robot: Robot) -> tuple[tuple[int
     """
     hidden: list[tuple[int, int]] = []
     for pair in pairs:
-        largest = np.array([_seen_std(robot, axis) for axis in pair.axes])
-        if np.any(pair.trial.deviations > largest):
+        largest_std = np.array([_largest_zero_std(robot, axis) for axis in pair.axes])
+        if np.any(pair.trial.deviations > largest_std):
             hidden.append(pair.axes)
     return tuple(hidden)
 
 
-def _seen_std(robot: Robot, axis: int) -> float:
-    """Largest σ of a zero that is seen [rad or m]."""
+def _largest_zero_std(robot: Robot, axis: int) -> float:
+    """Largest σ with which a wrong zero is still named [rad or m]."""
     if robot.axes[axis].kind is JointKind.PRISMATIC:
-        return SEEN_ZERO_M
-    return SEEN_ZERO_RAD
+        return LARGEST_ZERO_STD_M
+    return LARGEST_ZERO_STD_RAD
 
 
 def _tested(
@@ -687,11 +713,13 @@ def _tested(
     """Trials of families on all axes, built at the rows."""
     tested: list[FamilyTrials] = []
     for axis in range(len(problem.model.robot.places)):
-        fitting: list[tuple[Effect, ...]] = []
+        fitting: list[list[Effect]] = []
         for family in families:
-            members = tuple(one for one in family if is_placeable(one, axis, problem.model.robot))
-            fitting.append(tuple(one for one in members if fits_data(one, problem.rows, axis)))
-        tested += problem.test([family for family in fitting if family], axis, at_rows=True)
+            placeable = [one for one in family if is_placeable(one, axis, problem.model.robot)]
+            members = [one for one in placeable if fits_data(one, problem.rows, axis)]
+            if members:
+                fitting.append(members)
+        tested += problem.test(fitting, axis, at_rows=True)
     return tuple(tested)
 
 
@@ -725,9 +753,9 @@ def _columns_at_full_rate(
     placed: list[PlacedEffect] = []
     for family in _fast(families):
         for axis in axes:
-            placed += [
-                PlacedEffect(one, axis) for one in family if is_placeable(one, axis, model.robot)
-            ]
+            for effect in family:
+                if is_placeable(effect, axis, model.robot):
+                    placed.append(PlacedEffect(effect, axis))
     parts: dict[PlacedEffect, list[FloatArray]] = {one: [] for one in placed}
     for data in evidence.fit_runs:  # one after the other: signals at full rate are large
         signals = fitted_signals(model, data, evidence.training, evidence.estimate, began_s)
@@ -735,7 +763,7 @@ def _columns_at_full_rate(
             parts[one].append(
                 effect_torque(one.effect, one.axis, (signals,), (data,), conditioning, model)
             )
-    return {one: np.concatenate(own, axis=-1) for one, own in parts.items()}
+    return {one: np.concatenate(of_runs, axis=-1) for one, of_runs in parts.items()}
 
 
 def _problem_at_rows(evidence: Evidence) -> SearchProblem:

@@ -19,6 +19,7 @@ from ident.arrays import FloatArray
 from ident.discovery.beside_stops import fitted_clear_of_stops, turns_with_motion
 from ident.discovery.braking import describe_driving_friction
 from ident.discovery.candidates import (
+    CandidateTrial,
     ColumnCache,
     FamilyTrials,
     SearchProblem,
@@ -37,6 +38,7 @@ from ident.discovery.gates import (
     Gates,
     PartsLeftOut,
     certain_delays,
+    covariance_of,
     gain_shifts,
     impossible,
     in_noise,
@@ -61,8 +63,10 @@ from ident.effects.unnamed import is_unnamed
 from ident.errors import NotConverged, RankDeficient
 from ident.estimators.estimate import Estimate
 
-UNFITTED = (NotConverged, RankDeficient, np.linalg.LinAlgError)
-SHOWN = 0.999  #: Confidence of what instruments show: a dozen effects may ask them in one search
+#: Errors of a fit that its data do not determine
+FIT_ERRORS = (NotConverged, RankDeficient, np.linalg.LinAlgError)
+#: Confidence of a contradiction by instruments: one search tests a dozen effects by them
+INSTRUMENT_CONFIDENCE = 0.999
 #: Refits of an effect whose settings are fitted; each moves them by a fraction of the one before
 REFINEMENTS = 4
 
@@ -116,10 +120,12 @@ def linearised_after(evidence: Evidence, before: JointFit) -> JointFit:
     """Linearise around a refit; columns of motion are kept unless a correction has changed the
     motion.
     """
-    is_same = all(
-        one is other for one, other in zip(evidence.datasets, before.evidence.datasets, strict=True)
-    )
-    return linearised(evidence, before.search_problem.cache if is_same else ColumnCache())
+    pairs = zip(evidence.datasets, before.evidence.datasets, strict=True)
+    is_same_motion = all(data is data_before for data, data_before in pairs)
+    cache = before.search_problem.cache
+    if not is_same_motion:
+        cache = ColumnCache()
+    return linearised(evidence, cache)
 
 
 def keys_of(evidence: Evidence) -> frozenset[EffectKey]:
@@ -136,77 +142,111 @@ def join(
 ) -> JointFit | SetAside:
     """Refit with a finding in the model and drop what no longer passes;
     or say why it may not join.
+
+    Args:
+        model: without the finding.
+        accepted: the finding.
+        rng: of the bootstrap.
+        gates: limits.
+        seen: effects of each model that the search has had: without this, two effects that replace
+            each other would do so for ever.
     """
-    joined = _refit(model, accepted)
-    if isinstance(joined, JointFit):
-        accepted = as_joined(accepted, joined.evidence)
-    pruned = joined if isinstance(joined, SetAside) else _pruned(joined, accepted, rng, gates)
+    refitted = _refit(model, accepted)
+    if isinstance(refitted, SetAside):
+        return refitted
+    accepted = with_joint_settings(accepted, refitted.evidence)
+    pruned = _pruned(refitted, accepted, rng, gates)
     if isinstance(pruned, SetAside):
         return pruned
     if keys_of(pruned.evidence) in seen:
         return SetAside(accepted, "it would only exchange places with an effect that it replaces")
-    last = accepted.placed
-    if pruned is joined:
-        why = ""
-    else:
-        why = refuted_by_instruments(pruned.evidence, last)
-    why = why or refuted_clear_of_stops(pruned.evidence, last)
-    return SetAside(accepted, why) if why else pruned
+    placed = accepted.placed
+    # Instruments have been asked by the refit: again only where other effects have left since.
+    if pruned is not refitted:
+        why = refuted_by_instruments(pruned.evidence, placed)
+        if why:
+            return SetAside(accepted, why)
+    why = refuted_clear_of_stops(pruned.evidence, placed)
+    if why:
+        return SetAside(accepted, why)
+    return pruned
 
 
 def refuted_clear_of_stops(evidence: Evidence, placed: PlacedEffect) -> str:
     """Why an effect of a joint fit may be friction of joints at rest alone; empty where it may not.
 
-    In rows that are clear of stops it is then nearer to zero than to the fit. Rows that would not
-    show an effect of that size refute nothing.
+    Such friction is only in rows next to a stop. In a fit of rows that are clear of stops, the
+    effect is then nearer to zero than to the joint fit. Rows that would not show an effect of that
+    size refute nothing.
     """
     if not turns_with_motion(placed.effect):
         return ""
     try:
-        clear = fitted_clear_of_stops(evidence)
-    except UNFITTED:
+        clear_of_stops = fitted_clear_of_stops(evidence)
+    except FIT_ERRORS:
         return ""
-    why = _contradicted_by(clear, evidence, placed)
-    return f"in rows that are clear of stops, {why}" if why else ""
+    why = _contradicted_by(clear_of_stops, evidence, placed)
+    if not why:
+        return ""
+    return f"in rows that are clear of stops, {why}"
 
 
 def refuted_by_structure(
     model: JointFit, found: Finding, aside: Sequence[SetAside]
 ) -> SetAside | None:
-    """Why a name may not join: structure on its axis explains clearly more,
-    was set aside as it bends a gain, and the name bends one, too.
+    """Why a named effect may not join; None where nothing speaks against it.
 
-    The name is then only similar to the truth. It does no harm where it bends no gain, and is no
-    mistake where it still lowers the error beside the structure: then it explains something else. A
-    term against the time, or the session, refutes nothing where no run can be left out: it can
-    separate the loaded runs from the others.
+    It may not where unnamed structure on its axis explains clearly more, was set aside because it
+    bends a gain, and the named effect bends one, too: then it only resembles the truth. It does no
+    harm where it bends no gain. Where it still lowers the error with the structure in the model, it
+    explains something else. A term against the time, or the session, refutes nothing where no run
+    can be left out: it can separate the loaded runs from the others.
     """
     if is_unnamed(found.effect):
         return None
     problem = model.search_problem
     folds = model.search_problem.folds
-    unsure = () if runs_to_leave_out(problem.observation) else (Abscissa.TIME, Abscissa.SESSION)
+    ignored: tuple[Abscissa, ...] = ()
+    if not runs_to_leave_out(problem.observation):
+        ignored = (Abscissa.TIME, Abscissa.SESSION)
     before = float(folds.square_sum(folds.residual).sum())
-    for term in (one.finding for one in aside if one.moved and is_unnamed(one.finding.effect)):
-        if term.axis != found.axis or term.effect.abscissa in unsure:
+    for term in _structure_that_moves_gains(aside):
+        if term.axis != found.axis or term.effect.abscissa in ignored:
             continue
-        own, free = (whitened_columns(problem, one.effect, one.axis) for one in (found, term))
-        parts = slice(0, own.shape[1]), slice(own.shape[1], None), slice(None)
-        by_name, by_term, by_both = score_candidates(folds, np.hstack((own, free)), parts)
+        named_columns = whitened_columns(problem, found.effect, found.axis)
+        term_columns = whitened_columns(problem, term.effect, term.axis)
+        columns = np.hstack((named_columns, term_columns))
+        count = named_columns.shape[1]
+        candidates = [slice(0, count), slice(count, None), slice(None)]
+        by_name, by_term, by_both = score_candidates(folds, columns, candidates)
         if by_name is None or by_term is None or by_both is None:
             continue
-        left = by_name.left_out.sum(axis=1)
-        beside = by_both.left_out.sum(axis=1)
-        again = replace(
+        # ‖r‖² of each fold; the named effect is judged by this model, not by an earlier turn's.
+        name_errors = by_name.left_out.sum(axis=1)
+        term_errors = by_term.left_out.sum(axis=1)
+        both_errors = by_both.left_out.sum(axis=1)
+        named = replace(
             found,
             coefficients=by_name.coefficients,
-            fold_errors=left,
-            left_out_fall=before - float(left.sum()),
+            fold_errors=name_errors,
+            left_out_fall=before - float(name_errors.sum()),
         )
-        adds_to_term = is_better(beside, by_term.left_out.sum(axis=1))
-        if not adds_to_term and is_inadequate(again, term) and (moved := _moved_by(model, again)):
+        adds_to_term = is_better(both_errors, term_errors)
+        if adds_to_term or not is_inadequate(named, term):
+            continue
+        moved = _moved_by(model, named)
+        if moved:
             return SetAside(found, "{rival} explains clearly more", term.placed, moved)
     return None
+
+
+def _structure_that_moves_gains(aside: Sequence[SetAside]) -> list[Finding]:
+    """Unnamed terms that were set aside because they would move a gain."""
+    terms: list[Finding] = []
+    for one in aside:
+        if one.moved and is_unnamed(one.finding.effect):
+            terms.append(one.finding)
+    return terms
 
 
 def _refit(model: JointFit, accepted: Finding) -> JointFit | SetAside:
@@ -216,29 +256,34 @@ def _refit(model: JointFit, accepted: Finding) -> JointFit | SetAside:
     evidence = model.evidence
     problem = model.search_problem
     last = accepted.placed
-    # Asked before the refit, which takes longer.
-    if is_unnamed(last.effect) and (moved := _moved_by(model, accepted)):
-        return SetAside(accepted, moved=moved)
+    if is_unnamed(last.effect):
+        moved = _moved_by(model, accepted)  # to first order: a refit takes longer
+        if moved:
+            return SetAside(accepted, moved=moved)
     try:
         first_order = with_first_order_effects(evidence, (*evidence.effects, last), problem.runs)
-        # Asked here: after it, the linearised problem would take memory beside the instruments.
-        if why := refuted_by_instruments(first_order, last):
+        # Before the problem is linearised: it and the instruments together would need much memory.
+        why = refuted_by_instruments(first_order, last)
+        if why:
             return SetAside(accepted, why)
         refitted = settled_corrections(first_order)
-        if refitted is not first_order and (why := refuted_by_instruments(refitted, last)):
-            return SetAside(accepted, why)
+        if refitted is not first_order:
+            why = refuted_by_instruments(refitted, last)
+            if why:
+                return SetAside(accepted, why)
         joined = linearised_after(refitted, model)
         if is_correction(last):
-            joined = _all_resettled(joined)
+            joined = _with_all_refined(joined)
         else:
-            joined = resettled(joined)
-    except UNFITTED as error:
-        # The linearised problem distinguished the effect from the model, the whole one does not.
+            joined = with_refined_settings(joined)
+    except FIT_ERRORS as error:
+        # To first order the data told the effect from the model, in a complete fit they do not.
         return SetAside(accepted, f"it cannot be fitted: {error}")
-    terms = [placed for placed in refitted.effects if is_unnamed(placed.effect)]
-    if last in terms:  # no setting of theirs is refined
-        together = without_effects_of(joined.search_problem, refitted.estimate, terms)
-        if moved := moved_gains(together.gain_shifts, evidence.estimate.gains_std):
+    unnamed = [placed for placed in refitted.effects if is_unnamed(placed.effect)]
+    if last in unnamed:  # found by equality: no setting of an unnamed term is refined
+        reduced = without_effects_of(joined.search_problem, refitted.estimate, unnamed)
+        moved = moved_gains(reduced.gain_shifts, evidence.estimate.gains_std)
+        if moved:
             return SetAside(accepted, moved=moved)
     return joined
 
@@ -252,10 +297,11 @@ def _moved_by(model: JointFit, found: Finding) -> tuple[tuple[int, float], ...]:
     return moved_gains(gain_shifts(problem.folds, torque), model.evidence.estimate.gains_std)
 
 
-def resettled(model: JointFit, index: int = -1) -> JointFit:
+def with_refined_settings(model: JointFit, index: int = -1) -> JointFit:
     """Refine the settings of an effect around the joint fit and refit, until they stay as they are.
 
-    The model without an effect may be far off, and the settings that fit its residual best with it.
+    The settings that fit the residual of the model without the effect best may be far from those of
+    the joint fit, because that model is wrong.
 
     Args:
         model: the joint fit.
@@ -274,10 +320,10 @@ def resettled(model: JointFit, index: int = -1) -> JointFit:
     return model
 
 
-def _all_resettled(model: JointFit) -> JointFit:
-    """Refine the settings of every effect, which were those of another geometry."""
+def _with_all_refined(model: JointFit) -> JointFit:
+    """Refine the settings of every effect: those so far were found with a wrong geometry."""
     for index in range(len(model.evidence.effects)):
-        model = resettled(model, index)
+        model = with_refined_settings(model, index)
     return model
 
 
@@ -288,38 +334,38 @@ def _refined_in(model: JointFit, placed: PlacedEffect) -> Effect:
     estimate = model.evidence.estimate
     if effect.fits_rotor:
         own = own_unknowns(estimate, (placed,))
-        fitted = estimate.parameters[own], estimate.parameters_std[own]
-        return with_refined_rotor(model.search_problem, effect, axis, *fitted)
+        coefficients = estimate.parameters[own]
+        deviations = estimate.parameters_std[own]
+        return with_refined_rotor(model.search_problem, effect, axis, coefficients, deviations)
     if effect.refined:
         reduced = without_effects_of(model.search_problem, estimate, (placed,))
         return refine_together(reduced.search_problem, effect, axis)
     return effect
 
 
-def as_joined(accepted: Finding, evidence: Evidence) -> Finding:
+def with_joint_settings(accepted: Finding, evidence: Evidence) -> Finding:
     """A finding with the settings that its effect has in a joint fit."""
     key = effect_key(accepted.effect, accepted.axis)
-    found = (
-        placed.effect
-        for placed in evidence.effects
-        if effect_key(placed.effect, placed.axis) == key
-    )
-    return replace(accepted, effect=next(found, accepted.effect))
+    for placed in evidence.effects:
+        if effect_key(placed.effect, placed.axis) == key:
+            return replace(accepted, effect=placed.effect)
+    return accepted
 
 
 def refuted_by_instruments(evidence: Evidence, placed: PlacedEffect) -> str:
     """Why an effect of a joint fit may be a disturbance in the position loop alone;
     empty where it may not.
 
-    A torque that disturbs the arm moves it, and comes back in the current: columns of the recorded
-    motion then explain a part of it, which those of the demanded motion do not. What the columns
-    explain is then nearer to zero by instruments than to the fit: it may be zero, or it is another
-    number than that of the fit. Instruments that would not show an effect of that size refute no
-    named one; nor do those by which nothing can be fitted.
+    A torque that disturbs the arm moves it, and the loop answers with current. Columns made of the
+    recorded motion then explain a part of that current, which those of the demanded motion do not
+    (the bias of least squares in a closed loop). The coefficient by instruments is then nearer to
+    zero than to that of the fit: it may be zero, or it is another number. Instruments that would
+    not show an effect of that size refute no named one; nor do those by which nothing can be
+    fitted.
     """
     try:
         estimate = by_instruments(evidence)
-    except UNFITTED:
+    except FIT_ERRORS:
         return ""
     if estimate is None:
         return ""
@@ -334,10 +380,9 @@ def _contradicted_by(other: Estimate, evidence: Evidence, placed: PlacedEffect) 
     empty where it does not.
     """
     own = own_unknowns(other, (placed,))
-    place = len(other.gains) + own
     values = values_of(other, own)
     fitted = values_of(evidence.estimate, own)
-    return _contradiction(placed, values, fitted, other.covariance[np.ix_(place, place)])
+    return _contradiction(placed, values, fitted, covariance_of(other, own))
 
 
 def _contradiction(
@@ -351,19 +396,24 @@ def _contradiction(
         fitted: the same of the fit.
         covariance: of the values, shape (p, p).
     """
-    may_be_zero = in_noise(values, covariance, SHOWN)
-    if may_be_zero and is_unnamed(placed.effect):
-        return may_be_zero
+    why_zero = in_noise(values, covariance, INSTRUMENT_CONFIDENCE)
+    if why_zero and is_unnamed(placed.effect):
+        return why_zero
     precision = np.linalg.pinv(covariance, hermitian=True)
-    # |values − fitted|² > |values|²
+    # |values − fitted|² > |values|² in units of σ, multiplied out.
     is_nearer_to_zero = float(fitted @ precision @ (fitted - 2.0 * values)) > 0.0
     if not is_nearer_to_zero:
         return ""
-    if may_be_zero:
-        would_be_seen = not in_noise(fitted, covariance)
-        return may_be_zero if would_be_seen else ""
-    differs = not in_noise(fitted - values, covariance, SHOWN)
-    return _sizes_text(placed, values, fitted) if differs else ""
+    if why_zero:
+        # The other estimate refutes only an effect that it would have shown.
+        is_fit_in_its_noise = bool(in_noise(fitted, covariance))
+        if is_fit_in_its_noise:
+            return ""
+        return why_zero
+    is_same_in_noise = bool(in_noise(fitted - values, covariance, INSTRUMENT_CONFIDENCE))
+    if is_same_in_noise:
+        return ""
+    return _sizes_text(placed, values, fitted)
 
 
 def _sizes_text(placed: PlacedEffect, values: FloatArray, fitted: FloatArray) -> str:
@@ -381,37 +431,49 @@ def _pruned(
     or say why the last one may not stay.
     """
     last = model.evidence.effects[-1]
-    needed: set[PlacedEffect] = set()
+    indispensable: set[PlacedEffect] = set()  # the data cannot be fitted without these
     while True:
         evidence = model.evidence
-        judged = [
-            (placed, *beside_others(model, placed, rng, gates))
-            for placed in evidence.effects[evidence.declared :]
-        ]
-        failing = [one for one in judged if one[2] and one[0] not in needed]
+        failing: list[_Failing] = []
+        for placed in evidence.effects[evidence.declared :]:
+            left_out_fall, why = judge_beside_others(model, placed, rng, gates)
+            if why and placed not in indispensable:
+                failing.append(_Failing(placed, left_out_fall, why))
         if not failing:
             return model
-        named = next((placed for placed, _, _ in failing if not is_unnamed(placed.effect)), None)
-        if is_unnamed(last.effect) and named is not None:
-            return SetAside(accepted, "{rival} would no longer pass beside it", named)
-        worst, _, why = min(failing, key=lambda one: one[1])
-        if worst == last:
-            return SetAside(accepted, f"in the joint fit it no longer passes: {why}")
+        named = [one.placed for one in failing if not is_unnamed(one.placed.effect)]
+        if is_unnamed(last.effect) and named:
+            return SetAside(accepted, "{rival} would no longer pass beside it", named[0])
+        worst = min(failing, key=lambda one: one.left_out_fall)
+        if worst.placed == last:
+            return SetAside(accepted, f"in the joint fit it no longer passes: {worst.why}")
         try:
-            kept = tuple(placed for placed in evidence.effects if placed != worst)
-            rest = with_effects(evidence, kept, model.search_problem.runs)
-            model = linearised_after(rest, model)
-        except UNFITTED:
-            needed.add(worst)  # the data cannot be fitted without it
+            others = tuple(placed for placed in evidence.effects if placed != worst.placed)
+            refitted = with_effects(evidence, others, model.search_problem.runs)
+            model = linearised_after(refitted, model)
+        except FIT_ERRORS:
+            indispensable.add(worst.placed)
 
 
-def beside_others(
+@dataclass(frozen=True, slots=True)
+class _Failing:
+    """An effect of a joint fit that does not pass beside the others."""
+
+    placed: PlacedEffect
+    left_out_fall: float  #: fall of ‖e‖² on left-out moves
+    why: str
+
+
+def judge_beside_others(
     model: JointFit, placed: PlacedEffect, rng: np.random.Generator, gates: Gates
 ) -> tuple[float, str]:
-    """Judge an effect of a joint fit beside all others:
-    fall of ‖e‖² on left-out moves, and why it does not pass.
+    """Judge an effect of a joint fit beside all others.
+
+    Returns:
+        fall of ‖e‖² on left-out moves, and why it does not pass, empty where it does.
     """
-    is_delay = isinstance(placed.effect, Delay | LatePosition)
+    effect = placed.effect
+    is_delay = isinstance(effect, Delay | LatePosition)
     limits = gates
     if is_delay:
         # A delay is judged by its length: beside dry friction it is a small part of a motor's
@@ -421,42 +483,33 @@ def beside_others(
     reduced = without_effects_of(model.search_problem, estimate, (placed,))
     problem = reduced.search_problem
     columns = reduced.columns
-    forms = placed.effect.forms
-    trials = score_candidates(
-        problem.folds, columns, [slice(len(form.coefficients)) for form in forms]
-    )
-    members = tuple(
-        (form, trial) for form, trial in zip(forms, trials, strict=True) if trial is not None
-    )
+    # Simpler forms of the effect have the first columns of it.
+    of_forms = [slice(len(form.coefficients)) for form in effect.forms]
+    trials = score_candidates(problem.folds, columns, of_forms)
+    members: list[tuple[Effect, CandidateTrial]] = []
+    for form, trial in zip(effect.forms, trials, strict=True):
+        if trial is not None:
+            members.append((form, trial))
     if not members:
         return 0.0, "the model contains it already"
-    (finding,) = rank_families(problem, (FamilyTrials(placed.axis, members),), rng, limits)
+    family = FamilyTrials(placed.axis, tuple(members))
+    (finding,) = rank_families(problem, (family,), rng, limits)
     own = own_unknowns(estimate, (placed,))
     values = values_of(estimate, own)
-    place = len(estimate.gains) + own
-    joint = in_noise(values, estimate.covariance[np.ix_(place, place)])
+    covariance = covariance_of(estimate, own)
     deviations = estimate.parameters_std[own]
-    amplitude = ""
-    if placed.effect.reported is Reported.AMPLITUDE:
-        amplitude = uncertain_amplitude(values, estimate.covariance[np.ix_(place, place)])
-    uncertain = ""
+    reasons = [*finding.refusals, in_noise(values, covariance)]
     if is_delay:
-        uncertain = _uncertain_delay(finding, values, deviations, gates)
-    physics = impossible(placed.effect.coefficients, values, deviations)
-    if isinstance(placed.effect, SpeedFriction | PositionFriction):
-        drives = describe_driving_friction(model.evidence, placed.axis)
-    else:
-        drives = ""
-    reasons = (
-        *finding.refusals,
-        joint,
-        uncertain,
-        amplitude,
-        physics,
-        drives,
-        PartsLeftOut.of(problem).refusal(columns),
-    )
-    return finding.left_out_fall, "; ".join(dict.fromkeys(reason for reason in reasons if reason))
+        reasons.append(_uncertain_delay(finding, values, deviations, gates))
+    if effect.reported is Reported.AMPLITUDE:
+        reasons.append(uncertain_amplitude(values, covariance))
+    reasons.append(impossible(effect.coefficients, values, deviations))
+    if isinstance(effect, SpeedFriction | PositionFriction):
+        reasons.append(describe_driving_friction(model.evidence, placed.axis))
+    reasons.append(PartsLeftOut.of(problem).refusal(columns))
+    given = [reason for reason in reasons if reason]
+    each_once = dict.fromkeys(given)
+    return finding.left_out_fall, "; ".join(each_once)
 
 
 def _uncertain_delay(

@@ -21,12 +21,12 @@ import numpy as np
 from ident.discovery.evidence import Evidence, with_effects
 from ident.discovery.gates import Gates
 from ident.discovery.joining import (
-    UNFITTED,
+    FIT_ERRORS,
     JointFit,
     SetAside,
-    as_joined,
-    beside_others,
+    judge_beside_others,
     linearised_after,
+    with_joint_settings,
 )
 from ident.discovery.search import Finding
 from ident.effects.effect import PlacedEffect
@@ -64,12 +64,12 @@ def join_mistakes(
         try:
             evidence = _with_mistakes(model, kept, left)
             joined = linearised_after(evidence, model)
-        except UNFITTED as error:
+        except FIT_ERRORS as error:
             aside += [SetAside(one, f"it cannot be fitted: {error}") for one in left]
             break
         failing: list[tuple[float, Finding, str]] = []
         for one in left:
-            fall, why = beside_others(joined, one.placed, rng, gates)
+            fall, why = judge_beside_others(joined, one.placed, rng, gates)
             if why:
                 failing.append((fall, one, why))
         if failing:
@@ -83,7 +83,7 @@ def join_mistakes(
             continue
         return JoinedMistakes(
             model=joined,
-            joined=tuple(as_joined(one, evidence) for one in left),
+            joined=tuple(with_joint_settings(one, evidence) for one in left),
             models=_growing_models(model, kept, left, evidence),
             set_aside=tuple(aside),
         )
@@ -103,7 +103,7 @@ def _growing_models(
     for number in reversed(range(1, len(mistakes))):
         try:
             models.append(_with_mistakes(model, kept, mistakes[:number]))
-        except UNFITTED:
+        except FIT_ERRORS:
             models.append(models[-1])
     return tuple(reversed(models))
 
@@ -116,7 +116,7 @@ def _worst_of_model(
     """
     failing: list[tuple[float, PlacedEffect]] = []
     for placed in kept[joined.evidence.declared :]:
-        fall, why = beside_others(joined, placed, rng, gates)
+        fall, why = judge_beside_others(joined, placed, rng, gates)
         if why:
             failing.append((fall, placed))
     if not failing:

@@ -21,6 +21,7 @@ from ident.discovery.evidence import Evidence, place_names, with_effects, with_e
 from ident.discovery.gates import (
     Gates,
     PartsLeftOut,
+    covariance_of,
     impossible,
     in_noise,
     own_unknowns,
@@ -32,16 +33,16 @@ from ident.discovery.gates import (
 )
 from ident.discovery.geometry_check import CLOCK, check_geometry
 from ident.discovery.joining import (
-    UNFITTED,
+    FIT_ERRORS,
     JointFit,
     SetAside,
-    as_joined,
-    beside_others,
     join,
+    judge_beside_others,
     keys_of,
     linearised,
     linearised_after,
     refuted_by_structure,
+    with_joint_settings,
 )
 from ident.discovery.known_mistakes import JoinedMistakes, join_mistakes
 from ident.discovery.own_settings import propose_own_settings
@@ -356,9 +357,9 @@ def end_search(
     An effect leaves where its coefficients may all be zero by the covariance that is reported, none
     is larger than its own σ, or one of them is impossible. An effect that has passed beside another
     one must pass without it, too: after each that leaves, the rest is fitted again, and passes the
-    gates of a joint fit again (`beside_others`). Instruments, rows clear of stops and terms without
-    a name are not asked again: instruments take as long as a fit. The worst leaves first. An effect
-    that leaves here is not refuted by it, so that σ contains what it would move.
+    gates of a joint fit again (`judge_beside_others`). Instruments, rows clear of stops and terms
+    without a name are not asked again: instruments take as long as a fit. The worst leaves first.
+    An effect that leaves here is not refuted by it, so that σ contains what it would move.
 
     The choice of the effects adds to the σ of gains and parameters, not to that of an effect's own
     coefficients: another model has no such coefficient.
@@ -397,7 +398,7 @@ def end_search(
         try:
             rest = with_effects(evidence, others, model.search_problem.runs)
             model = linearised_after(replace(rest, declared=evidence.declared), model)
-        except UNFITTED:
+        except FIT_ERRORS:
             needed.add(worst)  # the data cannot be fitted without it
             continue
         opened.append(worst)
@@ -415,9 +416,8 @@ def _unshown(evidence: Evidence) -> list[tuple[PlacedEffect, str, float]]:
     failing: list[tuple[PlacedEffect, str, float]] = []
     for placed in evidence.effects[evidence.declared :]:
         own = own_unknowns(estimate, (placed,))
-        place = len(estimate.gains) + own
         values = values_of(estimate, own)
-        covariance = estimate.covariance[np.ix_(place, place)]
+        covariance = covariance_of(estimate, own)
         std = estimate.parameters_std[own]
         wrong = impossible(placed.effect.coefficients, values, std)
         # What is not possible shows nothing: a part below zero must not carry the other one.
@@ -443,7 +443,7 @@ def _failing_again(
     evidence = model.evidence
     failing: list[tuple[PlacedEffect, str, float]] = []
     for placed in evidence.effects[evidence.declared :]:
-        fall, why = beside_others(model, placed, rng, gates)
+        fall, why = judge_beside_others(model, placed, rng, gates)
         if why:
             failing.append((placed, why, -fall))
     return failing
@@ -572,7 +572,7 @@ def _turn(
         progress(f"adding {name_and_axis}")
         joined = refuted or join(model, accepted, rng, gates, seen)
         if isinstance(joined, JointFit):
-            accepted = as_joined(accepted, joined.evidence)
+            accepted = with_joint_settings(accepted, joined.evidence)
             if named is not None and is_unnamed(effect):
                 rival = PlacedEffect(effect, accepted.axis)
                 explains_more = "{rival} explains clearly more of the same residual"

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 
 from ident.discovery.candidates import SearchProblem, shares_explained
 from ident.discovery.gates import Gates
-from ident.discovery.search import is_tried, refine_setting
+from ident.discovery.search import is_testable, refine_setting
 from ident.effects.effect import Effect, is_shipped
 
 
@@ -47,7 +47,7 @@ def _members_that_explain(
     search_problem: SearchProblem, gates: Gates, family: tuple[Effect, ...], axis: int
 ) -> tuple[Effect, ...]:
     """The members that data can show on an axis; none where no member explains enough there."""
-    shown = [effect for effect in family if is_tried(search_problem, effect, axis)]
+    shown = [effect for effect in family if is_testable(search_problem, effect, axis)]
     fits = [fit for _, fit in search_problem.fits_at_rows(shown, axis)]
     shares = shares_explained(search_problem, fits)
     if max(shares, default=0.0) < gates.smallest_share:

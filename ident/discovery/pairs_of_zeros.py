@@ -16,7 +16,7 @@ import numpy as np
 from ident.arrays import FloatArray
 from ident.discovery.candidates import CandidateTrial, FamilyTrials, SearchProblem
 from ident.discovery.gates import Gates, probability_of_zero
-from ident.discovery.search import chances
+from ident.discovery.search import bootstrap_probabilities
 from ident.effects.effect import PlacedEffect
 from ident.effects.geometry_corrections import ZeroOffset
 
@@ -90,13 +90,14 @@ def pairs_that_pass(
     if all(probability > SCREENED_CHANCE for probability in by_wald):
         return ()
     passed: list[tuple[float, PairOfZeros]] = []
-    for pair, chance in zip(pairs, chances(trials, rng, gates.draws), strict=True):
+    probabilities = bootstrap_probabilities(trials, rng, gates.draws)
+    for pair, probability in zip(pairs, probabilities, strict=True):
         fall = pair.fall(problem)
         share_of_folds = float(np.mean(fall > 0.0))
         limits = CERTAIN_SIGMAS * pair.trial.deviations
         is_certain = np.all(np.abs(pair.trial.coefficients) > limits)
         is_better = fall.sum() > 0.0 and share_of_folds >= gates.folds_better
-        if is_certain and is_better and chance <= gates.false_alarm:
+        if is_certain and is_better and probability <= gates.false_alarm:
             passed.append((float(fall.sum()), pair))
     passed.sort(key=lambda one: -one[0])
     return tuple(pair for _, pair in passed)

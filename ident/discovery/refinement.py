@@ -53,7 +53,7 @@ def refine_together(search_problem: SearchProblem, effect: Effect, axis: int) ->
         torque_nm = search_problem.torque_at_rows(changed(values), axis)
         (fit,) = search_problem.fits([torque_nm])
         if fit is not None and is_strictly_possible(effect, fit):
-            return -float(fit.fallen.sum())
+            return -float(fit.fall_by_motor.sum())
         return 0.0
 
     start = np.array([effect.settings[name] for name in names])

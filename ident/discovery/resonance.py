@@ -162,7 +162,7 @@ def refined_gear(search_problem: SearchProblem, effect: Effect, axis: int) -> Ef
     for tried_form, fit in zip(forms, fits, strict=True):
         fall = 0.0
         if fit is not None and is_strictly_possible(tried_form, fit):
-            fall = float(fit.fallen.sum())
+            fall = float(fit.fall_by_motor.sum())
         falls.append(fall)
     return forms[int(np.argmax(falls))]
 

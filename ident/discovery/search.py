@@ -6,9 +6,10 @@ pass every gate:
 1. its Wald statistic, clustered by move, exceeds the largest one of all candidates in 99 % of draws
    that give the noise of each move a random sign (wild bootstrap, Cameron et al. 2008), or in 95 %
    if the candidate is strong (`Gates`). The joints of a robot are of one design: a family in the
-   model already competes on the other axes with itself alone. Corrections of the geometry compete
-   among themselves, too. The smaller probability counts, so that this gate alone lets noise pass in
-   up to two or three times 1 % (5 %) of all searches: `rank_families`;
+   model already competes on the other axes with itself alone, too, and corrections of the geometry
+   compete among themselves, too. The smaller of both probabilities counts, so that noise alone
+   passes this gate in more than 1 % (5 %) of all searches, up to three times as many:
+   `rank_families`;
 2. it lowers the error on at least three quarters of the folds of left-out moves;
 3. it explains at least 3 % of the squared residual of the motor that it affects most;
 4. that motor's error on left-out moves falls by at least 2 %;
@@ -26,7 +27,7 @@ Structure that no named effect explains is found in the same way: see `ident.dis
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 
@@ -57,16 +58,17 @@ from ident.effects.geometry_corrections import GeometryEffect, LatePosition
 from ident.effects.own import search_families
 from ident.effects.position import AlongTwoJoints, Compensator, Counterbalance, Hinge, Spring
 
-AS_GOOD = 0.99  #: Share of the best one's fall on left-out moves that counts as equal
-CABLE_MORE = 0.15
+#: An effect whose ‖e‖² on left-out moves falls by this share of the best one's fall is as good
+EQUAL_FALL_SHARE = 0.99
+CABLE_MARGIN = 0.15
 """Share by which a cable over two joints must explain more than a spring,
 a hinge or a compensator of one of them.
 """
-CLEARLY = 0.95
+PAIRED_CONFIDENCE = 0.95
 """Confidence of a paired comparison over folds (Student's t;
 folds share training data, so it is a rough one).
 """
-#: Steps of the golden section: the bracket between two neighbours becomes an eighteenth
+#: Steps of the golden section, each of which leaves 0.618 of the bracket: together an eighteenth
 GOLDEN_STEPS = 6
 GOLDEN = (np.sqrt(5.0) - 1.0) / 2.0
 OF_ONE_JOINT = (Spring, Hinge, Compensator, Counterbalance)
@@ -82,8 +84,8 @@ class Finding:
     axis: int  #: index of the joint (or motor)
     coefficients: FloatArray  #: first estimate of its linear parameters
     deviations: FloatArray  #: their σ by the scatter of moves
-    #: That noise alone makes a candidate this strong among all, or among those of known families;
-    #: None where it rests on too few moves for a test.
+    #: p-value: that noise alone makes the strongest of all candidates as strong, or of those that
+    #: it competes with (`rank_families`); None where it rests on too few moves for a test.
     probability: float | None
     folds_better: float  #: share of folds on which it lowers the error
     explained: float  #: share of the squared residual of the motor that it affects most
@@ -91,14 +93,15 @@ class Finding:
     error_before_percent: float
     error_after_percent: float  #: the same with it [%]
     error_fall: float  #: relative fall from one to the other
-    left_out_fall: float  #: fall of the whole whitened ‖e‖² on left-out moves; the rank
+    left_out_fall: float  #: fall of the whitened ‖e‖² of all motors on left-out moves; the rank
     passed: bool  #: whether it passes every gate
-    #: ‖e‖² of the whole on each fold, shape (folds,), for paired comparisons
+    #: whitened ‖e‖² of all motors on each fold, shape (folds,), for paired comparisons
     fold_errors: FloatArray
     #: Other effects that cannot be distinguished from this one by their score on left-out moves.
     ambiguity: tuple[PlacedEffect, ...] = ()
-    #: Of the motor's squared residual beyond noise, roughly: the noise is an estimate, often from
-    #: standstill. None where it is not known, or nothing is left beyond it. No gate uses it.
+    #: Rough share that it explains of what the motor's squared residual has beyond noise: the noise
+    #: is an estimate, often from standstill. None where that is not known, or the residual is no
+    #: larger than the noise. No gate uses it.
     share_of_excess: float | None = None
     refusals: tuple[str, ...] = ()  #: gates that it did not pass, in words
     #: What to record, where too few moves show it to tell it from noise: one of the refusals; else
@@ -138,14 +141,14 @@ def rank_effects(
         shared = [family for family in families if family[0].name not in names]
         fitting: list[tuple[Effect, ...]] = []
         for family in (*shared, *own):
-            members = tuple(one for one in family if is_tried(search_problem, one, axis))
+            members = tuple(one for one in family if is_testable(search_problem, one, axis))
             if members:
                 fitting.append(members)
         tested += search_problem.test(fitting, axis)
     return rank_families(search_problem, tested, rng, gates or Gates(), known)
 
 
-def is_tried(search_problem: SearchProblem, effect: Effect, axis: int) -> bool:
+def is_testable(search_problem: SearchProblem, effect: Effect, axis: int) -> bool:
     """Return whether an effect can be on an axis, and these data can show it there."""
     if not is_placeable(effect, axis, search_problem.model.robot):
         return False
@@ -173,11 +176,16 @@ def rank_families(
             geometry, because they are few beside hundreds of other candidates. They have no other
             precedence: `choose_effect` takes what lowers the error of left-out moves most.
 
-    The level of the smaller probability is not that of one. 2000 draws of noise with 60 moves,
-    heteroscedastic, and 100 independent candidates, of which 14 are corrections and 12 of known
-    families, pass a limit of 1 % in 1.4 % by all candidates, 2.5 % with the corrections and 3.8 %
-    with the known families; a limit of 5 % in 6.5, 10.8 and 14.6 %. The other gates are not in
-    these figures, and what noise makes of a whole search is in docs/evidence.
+    The smaller probability lets more noise pass than its limit says. A simulation of 2000 draws has
+    heteroscedastic noise of 60 moves, and 100 independent candidates, of which 14 are corrections
+    and 12 of known families. Some candidate passes
+
+        limit   against all   also among corrections   also among known families
+        1 %     1.4 %         2.5 %                    3.8 %
+        5 %     6.5 %         10.8 %                   14.6 %
+
+    of the draws. The other gates are not in these figures; docs/evidence has how often noise passes
+    a complete search.
     """
     if not tested:
         return ()
@@ -187,28 +195,33 @@ def rank_families(
         for effect, trial in family.members:
             effects.append(effect)
             trials.append(trial)
-    probability = chances(tuple(trials), rng, gates.draws)
+    probability = bootstrap_probabilities(tuple(trials), rng, gates.draws)
     is_known = np.array([effect.name in known for effect in effects])
     is_geometry = np.array([isinstance(effect, GeometryEffect) for effect in effects])
-    for alike in (is_known, is_geometry):
-        if not alike.any():
+    for is_in_group in (is_known, is_geometry):
+        if not is_in_group.any():
             continue
-        alike_trials = tuple(trials[index] for index in np.flatnonzero(alike))
-        among_them = chances(alike_trials, rng, gates.draws)
-        probability[alike] = np.fmin(probability[alike], among_them)
-    probabilities = iter(probability)
-    sizes = MotorSizes.of(search_problem)
-    findings = [_judge(search_problem, sizes, family, probabilities, gates) for family in tested]
+        group = tuple(trials[index] for index in np.flatnonzero(is_in_group))
+        within_group = bootstrap_probabilities(group, rng, gates.draws)
+        # fmin takes the number where the other is NaN, a candidate without a test.
+        probability[is_in_group] = np.fmin(probability[is_in_group], within_group)
+    counts = [len(family.members) for family in tested]
+    of_families = np.split(probability, np.cumsum(counts)[:-1])
+    squares = MotorSquares.of(search_problem)
+    findings: list[Finding] = []
+    for family, own_probability in zip(tested, of_families, strict=True):
+        findings.append(_judge(search_problem, squares, family, own_probability, gates))
     ranked = sorted(findings, key=lambda finding: -finding.left_out_fall)
-    return _with_rivals(ranked)
+    return _with_ambiguity(ranked)
 
 
-def _with_rivals(ranked: Sequence[Finding]) -> tuple[Finding, ...]:
+def _with_ambiguity(ranked: Sequence[Finding]) -> tuple[Finding, ...]:
     """Give each finding those that a paired comparison cannot distinguish from it."""
     errors = np.stack([finding.fold_errors for finding in ranked])
-    better = is_better(errors[:, None], errors[None])
+    better = is_better(errors[:, None], errors[None])  # [i, j]: i is better than j
     oneself = np.eye(len(ranked), dtype=np.bool_)
     rivals = ~(better | better.T | oneself)
+    # What does not lower the error is no rival of anything.
     rivals &= np.array([finding.left_out_fall > 0 for finding in ranked])
     places = [finding.placed for finding in ranked]
     compared: list[Finding] = []
@@ -235,8 +248,9 @@ def choose_effect(findings: Sequence[Finding], taken: Collection[EffectKey] = ()
         return None
     best = passed[0]
     if isinstance(best.effect, AlongTwoJoints):
-        simpler = (found for found in passed if _is_simpler_than_cable(found, best))
-        best = next(simpler, best)
+        simpler = [found for found in passed if _is_simpler_than_cable(found, best)]
+        if simpler:
+            best = simpler[0]
     alike = [found for found in passed if _is_as_good(found, best)]
     return min(alike, key=lambda finding: _parameter_count(finding.effect))
 
@@ -245,7 +259,7 @@ def _is_as_good(finding: Finding, best: Finding) -> bool:
     """Whether an effect on the same axis explains as much as the best one."""
     if finding.axis != best.axis:
         return False
-    if finding.left_out_fall < AS_GOOD * best.left_out_fall:
+    if finding.left_out_fall < EQUAL_FALL_SHARE * best.left_out_fall:
         return False
     if not best.effect.refined:
         return True
@@ -256,10 +270,12 @@ def _is_simpler_than_cable(found: Finding, cable: Finding) -> bool:
     """Whether one joint of a cable's pair alone, by its position, explains nearly as much."""
     if not isinstance(found.effect, OF_ONE_JOINT):
         return False
-    second_axis = (cable.effect.second_axis or 0) - 1
-    if found.axis not in (cable.axis, second_axis):
+    axes = [cable.axis]
+    if cable.effect.second_axis is not None:
+        axes.append(cable.effect.second_axis - 1)  # a number, from 1
+    if found.axis not in axes:
         return False
-    return cable.left_out_fall < (1.0 + CABLE_MORE) * found.left_out_fall
+    return cable.left_out_fall < (1.0 + CABLE_MARGIN) * found.left_out_fall
 
 
 def _parameter_count(effect: Effect) -> int:
@@ -279,15 +295,15 @@ def is_better(one: FloatArray, other: FloatArray) -> BoolArray:
     """
     gain = other - one
     freedom = gain.shape[-1] - 1
-    limit = scipy.special.stdtrit(freedom, 0.5 + CLEARLY / 2.0)
+    limit = scipy.special.stdtrit(freedom, 0.5 + PAIRED_CONFIDENCE / 2.0)
     return np.asarray(paired_t(gain) > limit)
 
 
 def paired_t(gain: FloatArray) -> FloatArray:
     """Student's t of the fall of ‖e‖² on each fold, shape (…, folds) → (…,)."""
-    scatter = np.std(gain, axis=-1, ddof=1)
-    error = scatter * np.sqrt(gain.shape[-1])
-    return np.asarray(gain.sum(axis=-1) / np.maximum(error, TINY))
+    fold_std = np.std(gain, axis=-1, ddof=1)
+    std_error = fold_std * np.sqrt(gain.shape[-1])  # of the sum over folds
+    return np.asarray(gain.sum(axis=-1) / np.maximum(std_error, TINY))
 
 
 def refine_setting(
@@ -305,9 +321,10 @@ def refine_setting(
     for name, value in effect.settings.items():
         if not isinstance(value, float):
             continue
-        # Members that differ from the effect in this setting alone.
-        alike = [member for member in family if member.with_settings({name: value}) == effect]
-        grid = sorted(member.settings[name] for member in alike)
+        differ_here_alone = [
+            member for member in family if member.with_settings({name: value}) == effect
+        ]
+        grid = sorted(member.settings[name] for member in differ_here_alone)
         if value not in grid or grid[0] <= 0:
             continue
         place = grid.index(value)
@@ -316,6 +333,7 @@ def refine_setting(
             continue
         lower = grid[place - 1]
         upper = grid[place + 1]
+        # The bracket stays on its side of the values that make the effect a declared term.
         declared = effect.nearly_declared.get(name)
         if declared is not None and value < declared.least:
             upper = min(upper, declared.least)
@@ -326,15 +344,15 @@ def refine_setting(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class MotorSizes:
-    """What all candidates of a turn are compared with."""
+class MotorSquares:
+    """Squares of the model without any candidate, which all of them are compared with."""
 
     before: FloatArray  #: ‖e‖² of each fold and motor on left-out moves, shape (folds, m)
     residual: FloatArray  #: ‖e‖² of each motor, shape (m,)
     current: FloatArray  #: ‖v‖² of each motor, shape (m,)
 
     @classmethod
-    def of(cls, search_problem: SearchProblem) -> MotorSizes:
+    def of(cls, search_problem: SearchProblem) -> MotorSquares:
         """Sum the squares of a problem around the model."""
         folds = search_problem.folds
         problem = folds.linearisation
@@ -353,19 +371,26 @@ class MotorSizes:
             squares: ‖e‖² of each fold and motor, shape (folds, m).
             motor: index of it.
         """
-        left = squares[:, motor].sum()
-        return float(np.sqrt(left / float(self.current[motor])))
+        error_square = squares[:, motor].sum()
+        return float(np.sqrt(error_square / float(self.current[motor])))
 
 
 def _judge(
     search_problem: SearchProblem,
-    sizes: MotorSizes,
+    motor_squares: MotorSquares,
     family: FamilyTrials,
-    probabilities: Iterator[float],
+    probability: FloatArray,
     gates: Gates,
 ) -> Finding:
-    """Judge the setting of a family that explains most."""
-    probability = [next(probabilities) for _ in family.members]
+    """Judge the setting of a family that explains most.
+
+    Args:
+        search_problem: around the model.
+        motor_squares: of the model.
+        family: its trials on one axis.
+        probability: of each member, shape (members,); NaN without a test.
+        gates: limits.
+    """
     members = family.members
     widths = [len(effect.coefficients) for effect, _ in members]
     ruled_out = [_ruled_out(effect, trial, min(widths)) for effect, trial in members]
@@ -374,32 +399,33 @@ def _judge(
     possible = [index for index, why in enumerate(ruled_out) if not why]
     if not possible:
         possible = list(range(len(members)))
-    explained = [float(trial.fallen.sum()) for _, trial in members]
-    best = max(possible, key=lambda index: explained[index])
+    falls = [float(trial.fall_by_motor.sum()) for _, trial in members]
+    best = max(possible, key=lambda index: falls[index])
     effect, trial = members[best]
-    before = sizes.before
     possible_members = tuple(members[index] for index in possible)
+    # ‖r‖² by fold and motor, without the family and with it.
+    before = motor_squares.before
     after = replace(family, members=possible_members).nested()
-    fall = before.sum(axis=1) - after.sum(axis=1)
+    fall_of_folds = before.sum(axis=1) - after.sum(axis=1)
     # Another motor may supply a joint's torque (R): the drive in question is the one whose residual
     # falls most.
-    motor = int(np.argmax(trial.fallen))
-    error_before = sizes.relative_error(before, motor)
-    error_after = sizes.relative_error(after, motor)
+    motor = int(np.argmax(trial.fall_by_motor))
+    error_before = motor_squares.relative_error(before, motor)
+    error_after = motor_squares.relative_error(after, motor)
     finding = Finding(
         effect=effect,
         axis=family.axis,
         coefficients=trial.coefficients,
         deviations=trial.deviations,
         probability=_probability_of(best, possible, widths, probability),
-        folds_better=float(np.mean(fall > 0)),
-        explained=float(trial.fallen[motor] / sizes.residual[motor]),
+        folds_better=float(np.mean(fall_of_folds > 0)),
+        explained=float(trial.fall_by_motor[motor] / motor_squares.residual[motor]),
         error_before_percent=100.0 * error_before,
         error_after_percent=100.0 * error_after,
         error_fall=1.0 - error_after / error_before,
-        left_out_fall=float(fall.sum()),
+        left_out_fall=float(fall_of_folds.sum()),
         passed=True,
-        share_of_excess=_share_of_excess(search_problem, sizes, trial, motor),
+        share_of_excess=_share_of_excess(search_problem, motor_squares, trial, motor),
         fold_errors=after.sum(axis=1),
         impossible=ruled_out[best],
     )
@@ -407,12 +433,18 @@ def _judge(
 
 
 def _probability_of(
-    best: int, possible: Sequence[int], widths: Sequence[int], probability: Sequence[float]
+    best: int, possible: Sequence[int], widths: Sequence[int], probability: FloatArray
 ) -> float | None:
     """Probability of the best setting of a family; None where none has a test.
 
-    High powers rest on few moves, whose random signs test nothing: the simplest form is surprising
-    for both.
+    A form with more columns, such as high powers, may rest on few moves, whose random signs test
+    nothing. The smallest probability of the family's simplest forms then speaks for it.
+
+    Args:
+        best: index of the member that explains most.
+        possible: indices of members with possible coefficients.
+        widths: number of columns of each member.
+        probability: of each member, shape (members,).
     """
     competing = [probability[best]]
     fewest = min(widths)
@@ -429,8 +461,8 @@ def _with_refusals(finding: Finding, trial: CandidateTrial, gates: Gates) -> Fin
     refusals: list[str] = []
     too_few_moves = ""
     if _may_be_noise(finding, gates):
-        if finding.probability is None or is_tested_on_others(trial.rest):
-            too_few_moves = what_to_record(finding.effect, trial.gram, trial.rest)
+        if finding.probability is None or is_tested_on_others(trial.without_leverage):
+            too_few_moves = what_to_record(finding.effect, trial.gram, trial.without_leverage)
             refusals.append(too_few_moves)
         else:
             refusals.append(f"noise makes one as strong with p = {finding.probability:.3f}")
@@ -464,7 +496,10 @@ def _may_be_noise(finding: Finding, gates: Gates) -> bool:
 
 
 def _may_be_small(finding: Finding) -> bool:
-    """Whether it is a mistake of the geometry: that is spread over all motors, and bends gains."""
+    """Whether it counts however little it explains of one motor: a mistake of the geometry does.
+
+    Such a mistake is spread over all motors, and bends gains.
+    """
     if isinstance(finding.effect, LatePosition):
         is_certain = certain_delays(finding.coefficients, finding.deviations)
         return bool(is_certain.all())
@@ -472,27 +507,28 @@ def _may_be_small(finding: Finding) -> bool:
 
 
 def _share_of_excess(
-    search_problem: SearchProblem, sizes: MotorSizes, trial: CandidateTrial, motor: int
+    search_problem: SearchProblem, motor_squares: MotorSquares, trial: CandidateTrial, motor: int
 ) -> float | None:
     """Share of a motor's squared residual beyond its noise; see `Finding.share_of_excess`."""
     floor_a = search_problem.floors_a[motor]
     if floor_a is None:
         return None
     problem = search_problem.folds.linearisation
-    # The residual is whitened: a row of noise alone has (floor/σ)² on average.
-    of_noise = float(problem.shown(motor) * (floor_a / problem.noise[motor]) ** 2)
-    excess = float(sizes.residual[motor]) - of_noise
+    # The residual is whitened by σ: the square of a row of noise alone is (floor/σ)² on average.
+    noise_square = float(problem.effective_rows(motor) * (floor_a / problem.noise[motor]) ** 2)
+    excess = float(motor_squares.residual[motor]) - noise_square
     if excess <= 0.0:
         return None
-    return min(float(trial.fallen[motor]) / excess, 1.0)
+    return min(float(trial.fall_by_motor[motor]) / excess, 1.0)
 
 
 def _ruled_out(effect: Effect, trial: CandidateTrial, fewest: int) -> str:
     """Name the coefficients that are impossible.
 
-    A form with more of them than the fewest of its family has no tolerance. Two that are nearly
-    collinear each hide in their σ, however certain both together are. What is left of a rotor may
-    be zero within its σ: it is fitted to say how well the rotor is known.
+    A coefficient may be outside of what physics allows by SIGMAS. A form with more of them than the
+    simplest of its family has no such tolerance: where two columns are nearly collinear, each σ is
+    large enough to excuse any value, however certain both together are. The rest of a rotor keeps
+    it: it is fitted only to say how well the rotor is known, and may well be zero.
     """
     is_richer = len(effect.coefficients) > fewest
     if is_richer and not effect.fits_rotor:
@@ -502,14 +538,20 @@ def _ruled_out(effect: Effect, trial: CandidateTrial, fewest: int) -> str:
     return impossible(effect.coefficients, trial.coefficients, trial.deviations, tolerance)
 
 
-def chances(trials: tuple[CandidateTrial, ...], rng: np.random.Generator, draws: int) -> FloatArray:
-    """Probability of each candidate's Wald statistic under random signs of the moves, shape (n,).
+def bootstrap_probabilities(
+    trials: tuple[CandidateTrial, ...], rng: np.random.Generator, draws: int
+) -> FloatArray:
+    """Probability that noise alone makes a candidate as strong, of each candidate, shape (n,).
 
-    It is that the largest statistic of all candidates is as large.
+    It is the share of draws of random signs of the moves in which the largest Wald statistic of all
+    candidates is as large as the candidate's own, on the scale of `_surprise` (wild cluster
+    bootstrap, Cameron, Gelbach & Miller 2008). So it is a p-value for the complete search.
 
-    A candidate that rests on few moves has a heavy tail, and would hide every other one: it
-    competes with all, but the others do not compete with it. It is tested without the moves of most
-    leverage where the others are enough, and has no probability (NaN) where no test is left.
+    A candidate that rests on few moves has draws with a heavy tail, in which no other one would
+    stand out. It is tested without the moves of most leverage where the other moves are enough.
+    Where they are not, it must exceed the draws of all candidates, while those that rest on many
+    moves need exceed only each other. It has no probability (NaN) where too few moves are left for
+    any test.
     """
     moves = len(trials[0].scatter)
     signs = rng.choice((-1.0, 1.0), size=(draws, moves))
@@ -518,46 +560,53 @@ def chances(trials: tuple[CandidateTrial, ...], rng: np.random.Generator, draws:
     for number, trial in enumerate(trials):
         if moves_behind(trial.gram) >= FEW_MOVES:
             of_many[number] = trial
-        elif trial.rest is not None and is_tested_on_others(trial.rest):
-            of_many[number] = trial.rest
+        elif trial.without_leverage is not None and is_tested_on_others(trial.without_leverage):
+            of_many[number] = trial.without_leverage
         elif moves_behind(trial.gram) >= FEWEST_MOVES:
             of_few[number] = trial
     probability = np.full(len(trials), np.nan)
-    surprise = np.zeros(draws)
-    for part in (of_many, of_few):
-        observed, drawn = _surprises(list(part.values()), signs)
-        surprise = np.maximum(surprise, drawn)
-        as_surprising = np.sum(surprise[None] >= observed[:, None], axis=1)
-        probability[list(part)] = (1.0 + as_surprising) / (draws + 1.0)
+    # The largest surprise of each draw: of the first group, then of both.
+    largest = np.zeros(draws)
+    for group in (of_many, of_few):
+        observed, drawn = _surprises(list(group.values()), signs)
+        largest = np.maximum(largest, drawn)
+        as_surprising = np.sum(largest[None] >= observed[:, None], axis=1)
+        probability[list(group)] = (1.0 + as_surprising) / (draws + 1.0)
     return probability
 
 
 def _surprises(candidates: Sequence[ByMove], signs: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Surprise of candidates, shape (c,), and of the most surprising one of each draw, (draws,)."""
+    """Surprise of candidates, shape (c,), and of the most surprising one of each draw, (draws,).
+
+    The Wald statistic of a candidate is sᵀ(XᵀX)⁻¹s, with s = Φ⊥ᵀe and X its scatter by clusters
+    (`ident.discovery.candidates`).
+
+    Args:
+        candidates: c of them.
+        signs: s_m of each draw and cluster, shape (draws, moves).
+    """
     widths = np.array([len(one.score) for one in candidates], dtype=np.int64)
     observed = np.empty(len(candidates))
-    surprise = np.zeros(len(signs))
+    largest = np.zeros(len(signs))
     for freedom in np.unique(widths).tolist():
         numbers = np.flatnonzero(widths == freedom).tolist()
         alike = [candidates[number] for number in numbers]
         score = np.stack([one.score for one in alike])
         scatter = np.stack([one.scatter for one in alike])
-        # The candidate is in the fit here: else its own torque would count as noise, and the
-        # strongest would hide best.
+        # X is of the fit with the candidate: otherwise its own torque would count as noise, the
+        # more the stronger it is.
         covariance = np.swapaxes(scatter, 1, 2) @ scatter
         inverse = np.linalg.pinv(covariance)
-        # sᵀ(XᵀX)⁻¹s of each candidate.
         wald = (score[:, None] @ inverse @ score[:, :, None])[:, 0, 0]
         if freedom == 1:
             gram = np.stack([one.gram[:, 0, 0] for one in alike], axis=1)
             drawn = _drawn_numbers(scatter[:, :, 0].T, gram, signs)
         else:
             drawn = reduce(np.maximum, (_drawn_wald(one, signs) for one in alike))
-        # On the scale of −log p, so that candidates with one and with two coefficients compete
-        # alike.
+        # On the scale of −log p, candidates with one and with two coefficients compare.
         observed[numbers] = _surprise(wald, freedom)
-        surprise = np.maximum(surprise, _surprise(drawn, freedom))
-    return observed, surprise
+        largest = np.maximum(largest, _surprise(drawn, freedom))
+    return observed, largest
 
 
 def _surprise(wald: FloatArray, freedom: int) -> FloatArray:
@@ -567,41 +616,42 @@ def _surprise(wald: FloatArray, freedom: int) -> FloatArray:
 
 
 def _drawn_wald(trial: ByMove, signs: FloatArray) -> FloatArray:
-    """Wald statistic of each draw, with a scatter of its own, shape (draws,).
+    """Wald statistic Sᵀ L⁻¹ S of each draw, shape (draws,).
 
-    With one scatter for all draws, few moves would look too certain. In a draw, x_m becomes s_m
-    x_m; its sum S is taken for an effect β = G⁻¹S, and the rest in move m is s_m x_m − G_m β (the
-    studentised wild bootstrap of Cameron, Gelbach & Miller, 2008).
+    In a draw, the noise x_m of each move m becomes s_m x_m. The sum S = Σ s_m x_m is taken for an
+    effect β = G⁻¹S, which leaves l_m = s_m x_m − G_m β in move m, and L = Σ l_m l_mᵀ. Each draw has
+    an L of its own (studentised wild bootstrap, Cameron, Gelbach & Miller 2008): with one for all
+    draws, few moves would look too certain.
     """
     x = trial.scatter
     gram = trial.gram
     moves, p = x.shape
-    sums = signs @ x
-    fitted = sums @ np.linalg.pinv(gram.sum(axis=0))
-    # Symmetric matrices by their lower triangle.
+    sums = signs @ x  # S
+    beta = sums @ np.linalg.pinv(gram.sum(axis=0))
+    # The three terms of L = Σ x_m x_mᵀ − Σ s_m(…) + Σ (G_m β)(G_m β)ᵀ. Symmetric matrices are
+    # stored by their lower triangle: entry (row, column) of each.
     row, column = np.tril_indices(p)
     # Σ_m x_m x_mᵀ, the same in all draws.
     fixed = (x.T @ x)[row, column]
     # Σ_m s_m (x_m (G_m β)ᵀ + (G_m β) x_mᵀ), linear in β.
     mixed = gram[:, column] * x[:, row, None]
     mixed = mixed + gram[:, row] * x[:, column, None]
-    drawn = signs @ mixed.reshape(moves, -1)
-    crossed = drawn.reshape(-1, len(row), p) @ fitted[:, :, None]
+    drawn_mixed = signs @ mixed.reshape(moves, -1)
+    crossed = drawn_mixed.reshape(-1, len(row), p) @ beta[:, :, None]
     # Σ_m (G_m β)(G_m β)ᵀ, linear in ββᵀ: one matrix for all draws.
     flat = gram.reshape(moves, -1)
     products = (flat.T @ flat).reshape(p, p, p, p)
     squares = products[row[:, None], row, column[:, None], column]
     mirrored = products[row[:, None], column, column[:, None], row]
     squares += np.where(row == column, 0.0, mirrored)
-    fitted_squares = fitted[:, row] * fitted[:, column]
-    left = np.empty((len(signs), p, p))
-    left[:, row, column] = fixed - crossed[:, :, 0] + fitted_squares @ squares.T
-    left[:, column, row] = left[:, row, column]
-    # A coefficient that no draw scatters
-    trace = np.trace(left, axis1=1, axis2=2)
-    left += 1e-12 * trace[:, None, None] * np.eye(p)
-    # SᵀL⁻¹S of each draw.
-    solution = np.linalg.solve(left, sums[:, :, None])[:, :, 0]
+    beta_squares = beta[:, row] * beta[:, column]
+    scatter = np.empty((len(signs), p, p))  # L
+    scatter[:, row, column] = fixed - crossed[:, :, 0] + beta_squares @ squares.T
+    scatter[:, column, row] = scatter[:, row, column]
+    # L is singular where a coefficient does not scatter in a draw.
+    trace = np.trace(scatter, axis1=1, axis2=2)
+    scatter += 1e-12 * trace[:, None, None] * np.eye(p)
+    solution = np.linalg.solve(scatter, sums[:, :, None])[:, :, 0]
     return np.asarray(np.sum(sums * solution, axis=1))
 
 
@@ -614,28 +664,30 @@ def _drawn_numbers(x: FloatArray, gram: FloatArray, signs: FloatArray) -> FloatA
         signs: s_m, shape (draws, moves).
     """
     sums = signs @ x
-    fitted = sums / gram.sum(axis=0)
+    beta = sums / gram.sum(axis=0)
     # Σ_m (s_m x_m − G_m β)² = Σ_m x_m² − 2 β Σ_m s_m x_m G_m + β² Σ_m G_m².
     fixed = np.sum(x**2, axis=0)
     crossed = signs @ (x * gram)
     squares = np.sum(gram**2, axis=0)
-    left = fixed - 2.0 * fitted * crossed + fitted**2 * squares
-    wald = sums**2 / left
+    scatter = fixed - 2.0 * beta * crossed + beta**2 * squares
+    wald = sums**2 / scatter
     return np.asarray(np.max(wald, axis=1))
 
 
 def _golden_section(
     search_problem: SearchProblem, effect: Effect, axis: int, name: str, lower: float, upper: float
 ) -> Effect:
+    """Refine one setting between two bounds where that lowers ‖e‖²; see `refine_setting`."""
     a = float(np.log(lower))
     b = float(np.log(upper))
 
-    def fall(x: float) -> float:
-        changed = effect.with_settings({name: float(np.exp(x))})
+    def fall(log_value: float) -> float:
+        """In-sample fall of ‖e‖² of all motors."""
+        changed = effect.with_settings({name: float(np.exp(log_value))})
         (fit,) = search_problem.fits([search_problem.torque(changed, axis)])
         if fit is None:
             return -np.inf
-        return float(fit.fallen.sum())
+        return float(fit.fall_by_motor.sum())
 
     inner = b - GOLDEN * (b - a)
     outer = a + GOLDEN * (b - a)

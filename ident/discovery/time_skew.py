@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 from ident.discovery.evidence import Evidence, by_instruments, refitted_around
 from ident.discovery.gates import own_unknowns
-from ident.discovery.joining import UNFITTED
+from ident.discovery.joining import FIT_ERRORS
 from ident.effects.effect import PlacedEffect
 from ident.effects.electrical import TimeSkew
 from ident.estimators.estimate import Estimate
@@ -78,7 +78,7 @@ def _beside(evidence: Evidence, placed: PlacedEffect) -> CurrentDelay | None:
     """
     try:
         refitted = refitted_around(evidence, (*evidence.effects, placed))
-    except UNFITTED:
+    except FIT_ERRORS:
         return None
     return _judged(refitted, placed, is_in_model=False)
 
@@ -89,7 +89,7 @@ def _judged(evidence: Evidence, placed: PlacedEffect, *, is_in_model: bool) -> C
     """
     try:
         estimate = by_instruments(evidence)
-    except UNFITTED:
+    except FIT_ERRORS:
         return None
     if estimate is None:
         return None

@@ -5,6 +5,12 @@ estimators/maximum_likelihood.py. Its derivative to a gain is built from the *pr
 from the measured current, so that the noise does not enter it. `motor_jacobian` is that derivative.
 Error bars leave out one move at a time (`left_out_shifts`); the search for effects leaves out folds
 of moves (`cut_into_folds`).
+
+With f unknowns, J is the Jacobian −∂e/∂(unknowns) of all rows, JᵀJ the Hessian of ‖e‖²/2, and Jᵀe
+the score. Where motors work against each other (a redundant drive), whitening also projects the
+internal preload N out of the rows: T_D = P D⁻¹ with P = 1 − D⁻¹N(NᵀD⁻²N)⁻¹NᵀD⁻¹ and D = diag(g_i
+σ_i) takes the place of D⁻¹ (`ident.equations.currents.whitening_transform`). Rows that share errors
+within a run are multiplied by V^(−1/2) (`ident.equations.run_scatter`).
 """
 
 from __future__ import annotations
@@ -23,8 +29,8 @@ from ident.equations.run_scatter import RunScatter
 from ident.equations.system import System
 from ident.errors import TooFewMoves
 
+#: Fields of a linearisation with one entry a row
 LINEARISATION_ROWS = ("residual", "current", "motor", "cluster", "source")
-"""Fields of a linearisation that have a number a row."""
 MIN_MOVES_TO_LEAVE_OUT = 8  #: With fewer, leaving one out shows little of the scatter
 FOLDS = MIN_MOVES_TO_LEAVE_OUT  #: Of moves; each holds one at least
 #: Columns of a candidate up to which the products of single rows are summed; see `MotorRows.grams`
@@ -96,7 +102,8 @@ def sum_of_squares(jacobian: Jacobian) -> FloatArray:
 class Linearisation:
     """Rows of all motors below each other, motor 1 first."""
 
-    jacobian: Jacobian  #: ∂(γ (T τ)/σ) per unit of each free unknown in its own scale
+    #: ∂(γ (T τ)/σ)/∂x, whitened, to the free unknowns in units of ``scale``
+    jacobian: Jacobian
     residual: FloatArray  #: whitened, shape (rows,)
     current: FloatArray  #: measured, whitened: what the residual is relative to, shape (rows,)
     motor: IntArray  #: of each row, shape (rows,)
@@ -109,10 +116,10 @@ class Linearisation:
     #: shape (f,).
     scale: FloatArray
     #: T_D of each of the observation's rows for a redundantly driven robot, shape (r, m, m); None
-    #: where it is D⁻¹.
+    #: where the whitening is D⁻¹, one number a motor.
     transform: FloatArray | None = None
-    #: Errors that the rows of a run share, and that the rows are decorrelated from; None where
-    #: there are none.
+    #: V, the covariance of errors that the rows of a run share; jacobian and residual have been
+    #: multiplied by V^(−1/2). None where rows share no errors.
     scatter: RunScatter | None = None
 
     @property
@@ -121,7 +128,10 @@ class Linearisation:
         return int(self.cluster.max()) + 1
 
     def of_clusters(self, per_row: IntArray) -> IntArray:
-        """Each cluster's number, (clusters,), of numbers of rows that clusters do not part."""
+        """Number of each cluster, (clusters,), from one of each of the observation's rows, (r,).
+
+        Such a number, of a run or a move, is the same in all rows of a cluster.
+        """
         _, first_rows = np.unique(self.cluster, return_index=True)
         return per_row[self.source[first_rows]]
 
@@ -130,8 +140,11 @@ class Linearisation:
         first, end = np.searchsorted(self.motor, (motor, motor + 1))
         return slice(int(first), int(end))
 
-    def shown(self, motor: int) -> float:
-        """Σ P_ii over a motor's rows: their number, less what internal preload hides of noise."""
+    def effective_rows(self, motor: int) -> float:
+        """Number of a motor's rows, less those whose noise the projection of preload takes out.
+
+        It is Σ P_ii of the motor i over its rows, the expectation of ‖e‖² of noise alone.
+        """
         rows = self.rows_of(motor)
         if self.transform is None:
             return float(rows.stop - rows.start)
@@ -140,8 +153,12 @@ class Linearisation:
         gamma = self.gamma[motor]
         return float(diagonal.sum() * noise / gamma)
 
-    def felt(self, torque_nm: FloatArray, to_motor: FloatArray) -> dict[int, FloatArray]:
-        """Whiten columns of joint torque, on the rows of each motor that needs any: (extra, rows).
+    def columns_by_motor(
+        self, torque_nm: FloatArray, to_motor: FloatArray
+    ) -> dict[int, FloatArray]:
+        """Further columns of the Jacobian from joint torque, by motor: whitened, decorrelated.
+
+        Only motors that must supply some of the torque have an entry, of shape (extra, rows).
 
         Args:
             torque_nm: per unit of each column, shape (m, extra, r).
@@ -154,9 +171,7 @@ class Linearisation:
     def whitened_by_motor(
         self, torque_nm: FloatArray, to_motor: FloatArray
     ) -> dict[int, FloatArray]:
-        """The same, (extra, rows), with what runs share still in the columns; see
-        `decorrelated_by_motor`.
-        """
+        """The same, whitened only: `decorrelated_by_motor` is still to be done."""
         by_motor: dict[int, FloatArray] = {}
         if self.transform is not None:
             for motor in range(len(self.gamma)):
@@ -168,22 +183,23 @@ class Linearisation:
         for joint in np.flatnonzero(torque_nm.any(axis=(1, 2))):
             for motor in np.flatnonzero(to_motor[:, joint]).tolist():
                 source = self.source[self.rows_of(motor)]
+                # γ_i T_ij/σ_i τ_j; several joints may load one motor.
                 scale = to_motor[motor, joint] * self.gamma[motor] / self.noise[motor]
-                own = torque_nm[joint].take(source, axis=1)
-                own *= scale
+                of_joint = torque_nm[joint].take(source, axis=1)
+                of_joint *= scale
                 if motor in by_motor:
-                    own = by_motor[motor] + own
-                by_motor[motor] = own
+                    by_motor[motor] = by_motor[motor] + of_joint
+                else:
+                    by_motor[motor] = of_joint
         return by_motor
 
     def decorrelated_by_motor(
         self, each: Sequence[dict[int, FloatArray]]
     ) -> list[dict[int, FloatArray]]:
-        """Take out of whitened columns what the rows of a run share; together, which is faster.
+        """Multiply whitened columns of several candidates by V^(−1/2); together, which is faster.
 
         Args:
-            each: columns on the rows of each motor that needs any, of some candidates, shapes
-                (extra, rows).
+            each: of each candidate, the columns by motor, shapes (extra, rows).
         """
         if self.scatter is None:
             return list(each)
@@ -200,10 +216,10 @@ class Linearisation:
                 decorrelated[number][motor] = part
         return decorrelated
 
-    def beside_scatter(
+    def decorrelated_from_runs(
         self, torque_nm: FloatArray, to_motor: FloatArray, run: IntArray
     ) -> Linearisation:
-        """The same problem, decorrelated from errors that rows of a run share; unknowns stay.
+        """The same problem with rows multiplied by V^(−1/2); the unknowns stay the same.
 
         Args:
             torque_nm: of one standard deviation of each error, shape (m, k, r).
@@ -237,7 +253,7 @@ class Linearisation:
         return replace(self, residual=residual), step
 
     def decorrelated(self, columns: FloatArray) -> FloatArray:
-        """V^(−1/2) times columns, shape (rows,); V is 1 where runs share no errors."""
+        """V^(−1/2) times one number a row, shape (rows,); V is 1 where runs share no errors."""
         if self.scatter is None:
             return columns
         parts: list[FloatArray] = []
@@ -248,7 +264,7 @@ class Linearisation:
         return np.concatenate(parts)
 
     def correlated(self, columns: FloatArray) -> FloatArray:
-        """V times decorrelated columns, shape (rows,); V is 1 where runs share no errors."""
+        """V times one number a row, shape (rows,); V is 1 where runs share no errors."""
         if self.scatter is None:
             return columns
         parts: list[FloatArray] = []
@@ -259,8 +275,8 @@ class Linearisation:
         return np.concatenate(parts)
 
     def whitened(self, torque_nm: FloatArray, to_motor: FloatArray) -> FloatArray:
-        """The same as further columns of the Jacobian, shape (rows, extra)."""
-        by_motor = self.felt(torque_nm, to_motor)
+        """The columns of `columns_by_motor` as one matrix with zeros, shape (rows, extra)."""
+        by_motor = self.columns_by_motor(torque_nm, to_motor)
         columns = np.zeros((torque_nm.shape[1], len(self.motor)))
         for motor, own in by_motor.items():
             columns[:, self.rows_of(motor)] = own
@@ -280,9 +296,9 @@ def linearise(
     """
     count = len(gains)
     width = count + len(parameters)
-    first = 0
+    first_free = 0
     if gains_fixed:
-        first = count
+        first_free = count
     used = [np.flatnonzero(use) for use in observation.motor_use]
     columns_and_rows = zip(observation.motor_columns(), used, strict=True)
     rows_of_motors = (columns[:, rows].T for columns, rows in columns_and_rows)
@@ -297,16 +313,17 @@ def linearise(
         rows_of_motors, preload, gains, parameters, noise
     ):
         squares += np.einsum("rf,rf->f", jacobian, jacobian)  # Σ_r J_rf²
-        own = np.flatnonzero(jacobian[:, first:].any(axis=0))
+        own = np.flatnonzero(jacobian[:, first_free:].any(axis=0))  # numbered among the free
         seen.append(own)
-        own_jacobian = jacobian[:, first + own]
+        own_jacobian = jacobian[:, first_free + own]
         parts.append(np.ascontiguousarray(own_jacobian.T))
         residuals.append(residual)
         currents.append(current)
+    # A gain is in units of itself, a parameter in that in which its column has the norm one.
     parameter_unit = _inverse_norms(squares[count:])
-    unit = np.concatenate((gains, parameter_unit))[first:]
+    unit = np.concatenate((gains, parameter_unit))[first_free:]
     for part, own in zip(parts, seen, strict=True):
-        np.multiply(part, unit[own, None], out=part)
+        np.multiply(part, unit[own, None], out=part)  # in place: the parts are large
     source = np.concatenate(used)
     row_counts = [len(rows) for rows in used]
     _, cluster = np.unique(observation.move[source], return_inverse=True)
@@ -314,7 +331,7 @@ def linearise(
     if preload.size:
         every_preload = observation.preload.transpose(2, 0, 1)
         transform = whitening_transform(every_preload, gains, noise)
-    jacobian_of_all = Jacobian(tuple(parts), tuple(seen), width - first)
+    jacobian_of_all = Jacobian(tuple(parts), tuple(seen), width - first_free)
     motor = np.repeat(np.arange(count), row_counts)
     return Linearisation(
         jacobian=jacobian_of_all,
@@ -325,7 +342,7 @@ def linearise(
         source=source,
         gamma=1.0 / gains,
         noise=noise,
-        free=np.arange(first, width),
+        free=np.arange(first_free, width),
         scale=unit,
         transform=transform,
     )
@@ -348,7 +365,8 @@ def motor_jacobians(
     """J, e and the measured current in units of its noise, of each motor's equations in turn.
 
     Args:
-        rows: of each motor, see `motor_jacobian`; with preload [V_i | …] of all of them alike.
+        rows: of each motor, see `motor_jacobian`. With preload, all motors have rows of the same
+            samples, and m columns V_i of currents in the place of v_i.
         preload: N of the rows, shape (r, m, m − d).
         gains, parameters, noise: see `motor_jacobian`.
     """
@@ -394,11 +412,14 @@ def motor_jacobian(
     jacobian[:, motor] = -scale / gain * torque  # ∂(γ τ)/∂g = −γ² τ
     jacobian[:, count:] = scale * columns
     current = rows[:, 0] / std_a
-    return jacobian, current - scale * torque
+    residual = current - scale * torque
+    return jacobian, residual
 
 
 def left_out_shifts(grams: FloatArray, scores: FloatArray) -> FloatArray:
-    """Shift when each cluster is left out, d_c = −(H − G_c)⁻¹ s_c with H = Σ G_c, shape (C, f).
+    """Shift of the estimate when each cluster is left out, shape (C, f).
+
+    It is d_c = −(H − G_c)⁻¹ s_c with H = Σ G_c, one step of Gauss-Newton.
 
     Args:
         grams: G_c = J_cᵀJ_c of each cluster, shape (C, f, f).
@@ -415,14 +436,17 @@ def left_out_shifts(grams: FloatArray, scores: FloatArray) -> FloatArray:
 
 
 def _even_unit(hessian: FloatArray) -> FloatArray:
-    """Units in which all unknowns are seen equally well, (f,): some are in kg, some in kg m²."""
+    """Units in which the diagonal of H is one, shape (f,): some unknowns are in kg, some in kg m².
+
+    The factorisation then compares like with like.
+    """
     diagonal = np.diag(hessian)
     squares = np.where(diagonal > 0.0, diagonal, 1.0)
     return 1.0 / np.sqrt(squares)
 
 
 def _solved(matrix: FloatArray, right: FloatArray) -> FloatArray:
-    """Solution by Cholesky's factorisation, or by least squares where the matrix is singular."""
+    """Solution of A x = b by Cholesky's factorisation; by least squares where A is singular."""
     try:
         factor = linalg.cho_factor(matrix, lower=True)
         return np.asarray(linalg.cho_solve(factor, right))
@@ -432,7 +456,7 @@ def _solved(matrix: FloatArray, right: FloatArray) -> FloatArray:
 
 
 def scatter_of(shifts: FloatArray) -> FloatArray:
-    """Jackknife covariance (C − 1)/C Σ (d_c − mean)(d_c − mean)ᵀ, shape (f, f).
+    """Jackknife covariance (C − 1)/C Σ (d_c − d̄)(d_c − d̄)ᵀ with the mean d̄, shape (f, f).
 
     Args:
         shifts: d_c of C clusters, shape (C, f).
@@ -452,9 +476,9 @@ def independent_blocks(grams: FloatArray, scores: FloatArray, runs: IntArray) ->
 
         r = Σ z_cᵀz_c₊₁ / Σ z_cᵀz_c,      z = L⁻¹ s,      L Lᵀ = H,
 
-    and its standard error is the root of Σ (z_cᵀz_c₊₁)² over the same sum; that of independent
-    clusters is a little below zero, because all scores together are zero. Blocks become longer
-    until r no longer shows (batch means: Fishman 1978).
+    and its standard error is √(Σ (z_cᵀz_c₊₁)²) / Σ z_cᵀz_c. The r of independent clusters is a
+    little below zero, because all scores together are zero. Blocks become longer until r is at most
+    CORRELATED standard errors (batch means: Fishman 1978).
 
     Args:
         grams: G_c of each cluster, shape (C, f, f), in the order of time.
@@ -477,8 +501,9 @@ def independent_blocks(grams: FloatArray, scores: FloatArray, runs: IntArray) ->
         products = np.sum(z[1:] * z[:-1], axis=1)
         is_same_run = runs[1:] == runs[:-1]
         products = products[is_same_run]
-        std_error = float(np.linalg.norm(products))
-        if float(products.sum()) <= CORRELATED * std_error:
+        # r and its standard error, both times Σ z_cᵀz_c.
+        scaled_error = float(np.linalg.norm(products))
+        if float(products.sum()) <= CORRELATED * scaled_error:
             return starts
         first = _every_other_of_run(runs)
         if len(first) < MIN_MOVES_TO_LEAVE_OUT:
@@ -518,8 +543,8 @@ def jackknife_covariance(
         gains, parameters: the estimate, gains in Nm/A, shapes (m,) and (p,).
         noise: σ_i of each motor's current [A], shape (m,).
         gains_fixed: the gains were given.
-        recorded: equations whose residuals count, where those of ``system`` are projected on
-            instruments.
+        recorded: equations whose residuals e are used, where J is of rows that are projected on
+            instruments (``iv``); those of ``system`` when None.
 
     Returns:
         shape (m + p, m + p).
@@ -594,17 +619,17 @@ def _sums_of_motors(
             recorded_rows = np.concatenate(of_recorded)
             _, residual = motor_jacobian(recorded_rows, motor, gains, parameters, noise)
         seen = np.flatnonzero(jacobian.any(axis=0))
-        own_jacobian = jacobian[:, seen]
+        seen_jacobian = jacobian[:, seen]
         ends = np.cumsum([len(of_cluster) for of_cluster in of_clusters])
-        products = np.empty((len(ends), len(seen), len(seen)))
+        seen_grams = np.empty((len(ends), len(seen), len(seen)))
         first = 0
         for index, end in enumerate(ends.tolist()):
-            of_cluster = own_jacobian[first:end]
-            own_residual = residual[first:end]
-            np.matmul(of_cluster.T, of_cluster, out=products[index])
-            scores[index, seen] += of_cluster.T @ own_residual
+            cluster_jacobian = seen_jacobian[first:end]
+            cluster_residual = residual[first:end]
+            np.matmul(cluster_jacobian.T, cluster_jacobian, out=seen_grams[index])
+            scores[index, seen] += cluster_jacobian.T @ cluster_residual
             first = end
-        grams[:, seen[:, None], seen] += products
+        grams[:, seen[:, None], seen] += seen_grams
     return grams, scores
 
 
@@ -614,11 +639,14 @@ class MotorRows:
 
     motor: int  #: index
     rows: slice  #: among those of the problem
-    starts: IntArray  #: first row of each block, counted from the motor's first, shape (blocks,)
+    #: first row of each block (the motor's rows in one cluster), counted from the motor's first,
+    #: shape (blocks,)
+    starts: IntArray
     fold: IntArray  #: of each block, ascending, shape (blocks,)
     cluster: IntArray  #: of each block, shape (blocks,)
     seen: IntArray  #: unknowns in the motor's equation, shape (s,)
-    equations: FloatArray  #: J of these, e and r, columns first, shape (s + 2, rows)
+    #: J of these, then e and r, columns first, shape (s + 2, rows); r as of `Folds.residual`
+    equations: FloatArray
 
     def sums(self, first: FloatArray, second: FloatArray) -> FloatArray:
         """Products A_b B_bᵀ of two sets of columns over each block, shape (blocks, …, a, b).
@@ -637,8 +665,9 @@ class MotorRows:
     def grams(self, columns: FloatArray) -> FloatArray:
         """Products A_b A_bᵀ over the rows of each block, shape (blocks, …, a, a); see `sums`.
 
-        The products of a few columns are summed along memory, because a matrix product for each
-        block and candidate would be a call for a few dozen numbers.
+        Up to MOST_SUMMED columns are multiplied by pairs on all rows and then summed block by
+        block, because a matrix product for each block and candidate would be a call for a few dozen
+        numbers.
         """
         count = columns.shape[-2]
         if count > MOST_SUMMED:
@@ -654,7 +683,7 @@ class MotorRows:
         return out
 
     def predicted(self, steps: Sequence[FloatArray]) -> FloatArray:
-        """J x of the motor's rows, (rows,) or (p, rows), with an x a block, (f,) or (p, f)."""
+        """J x_b of the motor's rows, (rows,) or (p, rows), by x_b of each block, (f,) or (p, f)."""
         jacobian = self.equations[:-2]
         parts: list[FloatArray] = []
         for step, block in zip(steps, self._blocks(), strict=True):
@@ -737,6 +766,7 @@ def cut_into_folds(problem: Linearisation, move_of: IntArray | None = None) -> F
     if moves < MIN_MOVES_TO_LEAVE_OUT:
         raise TooFewMoves(moves, MIN_MOVES_TO_LEAVE_OUT)
     fold_of = move_of % FOLDS
+    # By motor, then fold, then cluster: the last key of lexsort is the first to count.
     order = np.lexsort((problem.cluster, fold_of[problem.cluster], problem.motor))
     orders = _orders_of_motors(problem, order)
     problem = _with_sorted_rows(problem, order, orders)
@@ -765,13 +795,13 @@ def cut_into_folds(problem: Linearisation, move_of: IntArray | None = None) -> F
     part_score = np.zeros_like(sums.part_hessian[..., 0])
     for own in by_motor:
         steps_of_blocks = [steps[fold] for fold in own.fold]
-        own_residual = own.equations[-1]
         predicted = own.predicted(steps_of_blocks)
+        own_residual = own.equations[-1]  # a view: r of the motor's equations is written here
         own_residual[:] = problem.residual[own.rows] - predicted
         residual[own.rows] = own_residual
-        products = own.sums(own.equations[:-2], own_residual[None])
-        scores_of_motor = part_score[:, own.motor]
-        scores_of_motor[:, own.seen] = own.by_fold(products[..., 0], FOLDS)
+        scores_of_blocks = own.sums(own.equations[:-2], own_residual[None])
+        scores_of_motor = part_score[:, own.motor]  # a view, too
+        scores_of_motor[:, own.seen] = own.by_fold(scores_of_blocks[..., 0], FOLDS)
     problem = _with_sorted_jacobian(problem, by_motor)
     full_factor = _lower_factor(hessian)
     estimate_factor = full_factor
@@ -896,7 +926,7 @@ def _sums_of(by_motor: Sequence[MotorRows], problem: Linearisation) -> _Sums:
         scores = products[..., -1]
         sums.cluster_hessian[np.ix_(own.cluster, seen, seen)] += grams
         sums.cluster_score[np.ix_(own.cluster, seen)] += scores
-        hessian_of_motor = sums.part_hessian[:, own.motor]
+        hessian_of_motor = sums.part_hessian[:, own.motor]  # a view
         hessian_of_motor[:, seen[:, None], seen] = own.by_fold(grams, FOLDS)
         sums.motor_score[own.motor, seen] = scores.sum(axis=0)
     return sums
@@ -920,9 +950,12 @@ def _lower_factor(matrix: FloatArray) -> tuple[FloatArray, bool]:
 def _estimate_factor(
     problem: Linearisation, scatter: RunScatter, hessian: FloatArray
 ) -> tuple[FloatArray, bool]:
-    """Cholesky factor of J₀ᵀJ₀ = JᵀVJ from JᵀJ; J = V^(−1/2) J₀ is the decorrelated Jacobian."""
+    """Cholesky factor of J₀ᵀJ₀, with J = V^(−1/2) J₀ the decorrelated Jacobian.
+
+    It is JᵀVJ = JᵀJ + Jᵀ(V − 1)J, and JᵀJ is known.
+    """
     jacobian = problem.jacobian
-    undone = hessian.copy()
+    of_estimate = hessian.copy()
     for motor, (part, seen) in enumerate(zip(jacobian.parts, jacobian.seen, strict=True)):
-        undone[np.ix_(seen, seen)] += scatter.shared(motor, part)
-    return _lower_factor(undone)
+        of_estimate[np.ix_(seen, seen)] += scatter.shared(motor, part)
+    return _lower_factor(of_estimate)

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from ident.discovery.candidate_fits import CandidateFit, Felt, fit_candidates
+from ident.discovery.candidate_fits import CandidateFit, WhitenedColumns, fit_candidates
 from ident.discovery.candidates import score_candidates
 from ident.equations.linearisation import Folds, cut_into_folds
 from tests.ident.discovery.random_problem import WIDTH, fitted_to, random_problem
@@ -17,19 +17,19 @@ from tests.ident.recordings import whole
 FloatArray = NDArray[np.float64]
 
 
-def _felt(folds: Folds, columns: FloatArray) -> Felt:
-    """Columns by motor; a motor whose rows are zero feels nothing."""
-    felt: dict[int, FloatArray] = {}
+def _whitened(folds: Folds, columns: FloatArray) -> WhitenedColumns:
+    """Columns by motor; a motor whose rows are zero is not loaded."""
+    by_motor: dict[int, FloatArray] = {}
     for own in folds.motors:
         part = columns[own.rows].T
         if part.any():
-            felt[own.motor] = part
-    return felt
+            by_motor[own.motor] = part
+    return by_motor
 
 
 def _fits(folds: Folds, candidates: list[FloatArray]) -> tuple[CandidateFit | None, ...]:
-    widths_and_felt = ((one.shape[1], _felt(folds, one)) for one in candidates)
-    return fit_candidates(folds, widths_and_felt)
+    widths_and_columns = ((one.shape[1], _whitened(folds, one)) for one in candidates)
+    return fit_candidates(folds, widths_and_columns)
 
 
 def _candidates(rng: np.random.Generator, folds: Folds, widths: list[int]) -> list[FloatArray]:
@@ -62,12 +62,12 @@ def test_a_fit_has_the_numbers_of_a_trial_and_of_least_squares(
         assert fit is not None
         assert trial is not None
         assert fit.coefficients == pytest.approx(trial.coefficients, rel=1e-9, abs=1e-12)
-        assert fit.fallen == pytest.approx(trial.fallen, rel=1e-9, abs=1e-9)
+        assert fit.fall_by_motor == pytest.approx(trial.fall_by_motor, rel=1e-9, abs=1e-9)
         both = np.concatenate((jacobian, columns), axis=1)
         after = problem.residual - both @ fitted_to(both, problem.residual)
         change = problem.residual**2 - after**2
         by_motor = np.bincount(problem.motor, change)
-        assert fit.fallen == pytest.approx(by_motor, rel=1e-7, abs=1e-7)
+        assert fit.fall_by_motor == pytest.approx(by_motor, rel=1e-7, abs=1e-7)
 
 
 def test_candidates_that_the_model_contains_leave_the_others_of_their_batch_as_they_are() -> None:
@@ -86,7 +86,7 @@ def test_candidates_that_the_model_contains_leave_the_others_of_their_batch_as_t
         assert own is not None
         assert beside is not None
         assert beside.coefficients == pytest.approx(own.coefficients, rel=1e-9)
-        assert beside.fallen == pytest.approx(own.fallen, rel=1e-9, abs=1e-12)
+        assert beside.fall_by_motor == pytest.approx(own.fall_by_motor, rel=1e-9, abs=1e-12)
     slices = [slice(0, 2), slice(2, 4), slice(4, 6), slice(6, 8)]
     columns = np.concatenate((contained, first, contained, second), axis=1)
     trials = score_candidates(folds, columns, slices)
@@ -95,7 +95,7 @@ def test_candidates_that_the_model_contains_leave_the_others_of_their_batch_as_t
     for own, trial in zip(alone, (trials[1], trials[3]), strict=True):
         assert own is not None
         assert trial is not None
-        assert trial.fallen == pytest.approx(own.fallen, rel=1e-9, abs=1e-12)
+        assert trial.fall_by_motor == pytest.approx(own.fall_by_motor, rel=1e-9, abs=1e-12)
 
 
 @given(seed=st.integers(0, 2**32 - 1), width=st.integers(1, 4))

@@ -210,7 +210,8 @@ def test_internal_preload_is_no_error() -> None:
     assert floor.axes == pytest.approx(errors.in_sample.axes, rel=0.02)
     search_problem = search_problem_of(evidence)
     shown = [
-        search_problem.folds.linearisation.shown(motor) for motor in range(len(estimate.gains))
+        search_problem.folds.linearisation.effective_rows(motor)
+        for motor in range(len(estimate.gains))
     ]
     mobility = made.model.assembly.mobility
     assert sum(shown) == pytest.approx(mobility * np.sum(rows.motor_use[0]))

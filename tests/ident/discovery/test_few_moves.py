@@ -91,7 +91,7 @@ def _judged(problem: SearchProblem, *trials: CandidateTrial) -> list[Finding]:
     """Findings of a saturation in the order of the trials,
     which are given the shapes of a robot with three motors.
     """
-    shaped = [replace(one, left_out=np.zeros((8, 3)), fallen=np.ones(3)) for one in trials]
+    shaped = [replace(one, left_out=np.zeros((8, 3)), fall_by_motor=np.ones(3)) for one in trials]
     families = [FamilyTrials(0, ((Saturation(), one),)) for one in shaped]
     rng = np.random.default_rng(2)
     ranked = rank_families(problem, families, rng, GATES)
@@ -109,7 +109,7 @@ def test_without_the_moves_of_most_leverage_is_a_fit_of_the_others() -> None:
     candidates = [slice(0, 1)]
     (trial,) = score_candidates(folds, columns, candidates)
     assert trial is not None
-    assert trial.rest is not None
+    assert trial.without_leverage is not None
     gram_order = np.argsort(trial.gram[:, 0, 0])
     largest = gram_order[-LEVERAGE:]
     others = ~np.isin(problem.cluster, largest)
@@ -117,11 +117,12 @@ def test_without_the_moves_of_most_leverage_is_a_fit_of_the_others() -> None:
     fitted = np.linalg.lstsq(both, problem.residual[others], rcond=None)[0]
     left = both[:, -1] - both[:, :-1] @ np.linalg.lstsq(both[:, :-1], both[:, -1], rcond=None)[0]
     after = problem.residual[others] - both @ fitted
-    assert trial.rest.score[0] / trial.rest.gram.sum() == pytest.approx(fitted[-1], rel=1e-6)
+    rest = trial.without_leverage
+    assert rest.score[0] / rest.gram.sum() == pytest.approx(fitted[-1], rel=1e-6)
     expected = np.bincount(problem.cluster[others], left * after, minlength=MOVES)
-    np.testing.assert_allclose(trial.rest.scatter[:, 0], expected, atol=1e-6)
+    np.testing.assert_allclose(trial.without_leverage.scatter[:, 0], expected, atol=1e-6)
     np.testing.assert_allclose(
-        trial.rest.gram[:, 0, 0],
+        trial.without_leverage.gram[:, 0, 0],
         np.bincount(problem.cluster[others], left**2, minlength=MOVES),
         atol=1e-6,
     )

@@ -245,13 +245,13 @@ def _noise_trial(
     gram = np.einsum("mra,mrb->mab", x, x)
     score = np.einsum("mra,mr->ma", x, e)
     coefficients = np.linalg.solve(gram.sum(axis=0), score.sum(axis=0))
-    fallen = np.array([float(score.sum(axis=0) @ coefficients)])
+    fall_by_motor = np.array([float(score.sum(axis=0) @ coefficients)])
     scatter = score - gram @ coefficients
     left_out = np.zeros((8, 1))
     training_fall = np.zeros(8)
     return CandidateTrial(
         coefficients=coefficients,
-        fallen=fallen,
+        fall_by_motor=fall_by_motor,
         training_fall=training_fall,
         left_out=left_out,
         score=score.sum(axis=0),
@@ -273,7 +273,7 @@ def test_the_bootstrap_keeps_its_size(
     false = 0
     for _ in range(400):
         trial = replace(
-            _noise_trial(rng, moves, columns), left_out=np.zeros((8, 3)), fallen=np.ones(3)
+            _noise_trial(rng, moves, columns), left_out=np.zeros((8, 3)), fall_by_motor=np.ones(3)
         )
         members = ((effect, trial),)
         tested = [FamilyTrials(0, members)]

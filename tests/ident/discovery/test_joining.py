@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from ident.discovery.candidates import ColumnCache
 from ident.discovery.evidence import with_effects
 from ident.discovery.gates import Gates
-from ident.discovery.joining import _contradiction, beside_others, linearised
+from ident.discovery.joining import _contradiction, judge_beside_others, linearised
 from ident.effects.effect import PlacedEffect
 from ident.effects.friction import NonlinearViscous
 from ident.effects.geometry_corrections import LatePosition
@@ -84,5 +84,5 @@ def test_a_delay_that_explains_little_must_be_far_from_zero(delay_ms: float, sta
     joint = linearised(fitted, ColumnCache())
     rng = np.random.default_rng(0)
     placed = fitted.effects[0]
-    _, why = beside_others(joint, placed, rng, Gates())
+    _, why = judge_beside_others(joint, placed, rng, Gates())
     assert ("it explains little, and is less than 5 σ from zero" in why) is not stays

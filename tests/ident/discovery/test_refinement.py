@@ -55,9 +55,9 @@ class _Hill:
         centre_difference = centre - BEST[0]
         width_difference = width - BEST[1]
         distance = centre_difference**2 + width_difference**2
-        fallen = np.array([SCALE / (1.0 + distance)])
+        fall_by_motor = np.array([SCALE / (1.0 + distance)])
         coefficients = np.array([1.0])
-        return [CandidateFit(coefficients=coefficients, fallen=fallen)]
+        return [CandidateFit(coefficients=coefficients, fall_by_motor=fall_by_motor)]
 
 
 def _refined(centre_rad: float, width_rad: float) -> tuple[float, ...]:

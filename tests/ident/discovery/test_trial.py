@@ -43,7 +43,7 @@ def _written_out(problem: Linearisation, columns: FloatArray, count: int = 8) ->
         training.append(float(difference))
         held.append(by_motor(e - both @ fitted, out))
     moves = [problem.cluster == move for move in range(MOVES)]
-    fallen = np.array(by_motor(e, everything)) - np.array(by_motor(after, everything))
+    fall_by_motor = np.array(by_motor(e, everything)) - np.array(by_motor(after, everything))
     scatter = np.stack([left[rows].T @ after[rows] for rows in moves])
     gram = np.stack([left[rows].T @ left[rows] for rows in moves])
     score = left.T @ e
@@ -51,7 +51,7 @@ def _written_out(problem: Linearisation, columns: FloatArray, count: int = 8) ->
     left_out = np.array(held)
     return CandidateTrial(
         coefficients=coefficients,
-        fallen=fallen,
+        fall_by_motor=fall_by_motor,
         training_fall=training_fall,
         left_out=left_out,
         score=score,

@@ -230,14 +230,14 @@ def test_torque_columns_are_whitened_on_the_rows_of_every_motor_that_needs_them(
         assert_allclose(found[row], expected)
     of_second_joint = np.zeros_like(torque_nm)
     of_second_joint[1] = torque_nm[1]
-    motors = problem.felt(of_second_joint, TO_MOTOR)
+    motors = problem.columns_by_motor(of_second_joint, TO_MOTOR)
     assert set(motors) == {1}
 
 
 def test_rows_of_a_motor_and_clusters_are_counted(problem: Linearisation) -> None:
     assert problem.cluster_count == CLUSTERS
     assert problem.rows_of(1) == slice(SAMPLES, 2 * SAMPLES - 6)
-    assert problem.shown(1) == SAMPLES - 6
+    assert problem.effective_rows(1) == SAMPLES - 6
     per_row = np.zeros(SAMPLES, dtype=np.int64)
     per_row[problem.source] = 10 * problem.cluster
     of_clusters = problem.of_clusters(per_row)
@@ -248,7 +248,7 @@ def test_errors_that_a_run_shares_are_taken_out_and_put_back(problem: Linearisat
     rng = np.random.default_rng(5)
     deviations = rng.normal(size=(3, 1, SAMPLES))
     run = np.arange(SAMPLES) % 2
-    beside = problem.beside_scatter(deviations, np.eye(3), run)
+    beside = problem.decorrelated_from_runs(deviations, np.eye(3), run)
     rows = dense(problem)
     whitened = problem.whitened(deviations, np.eye(3))
     for motor in range(3):
@@ -276,7 +276,7 @@ def test_candidates_are_decorrelated_together_as_each_alone(problem: Linearisati
     rng = np.random.default_rng(6)
     deviations = rng.normal(size=(3, 1, SAMPLES))
     run = np.arange(SAMPLES) % 2
-    beside = problem.beside_scatter(deviations, np.eye(3), run)
+    beside = problem.decorrelated_from_runs(deviations, np.eye(3), run)
     scatter = beside.scatter
     assert scatter is not None
     rows_of_first = np.count_nonzero(problem.motor == 0)
@@ -300,7 +300,7 @@ def test_the_estimates_factor_is_of_rows_that_share_no_errors(problem: Linearisa
     rng = np.random.default_rng(7)
     deviations = rng.normal(size=(3, 1, SAMPLES))
     run = np.arange(SAMPLES) % 2
-    beside = problem.beside_scatter(deviations, np.eye(3), run)
+    beside = problem.decorrelated_from_runs(deviations, np.eye(3), run)
     folds = cut_into_folds(beside)
     lower = np.tril(folds.estimate_factor[0])
     rows = dense(problem)
@@ -321,4 +321,4 @@ def test_preload_mixes_the_torques_of_all_joints_row_by_row(problem: Linearisati
         assert_allclose(found[row], expected)
     rows = mixed.rows_of(2)
     diagonal = transform[problem.source[rows], 2, 2]
-    assert mixed.shown(2) == pytest.approx(diagonal.sum() * 0.2 / 1.5)
+    assert mixed.effective_rows(2) == pytest.approx(diagonal.sum() * 0.2 / 1.5)

@@ -114,8 +114,8 @@ def test_clusters_and_rows_of_a_motor_are_counted_over_all_motors() -> None:
     assert run_of_cluster.tolist() == [3, 8, 9]
     assert lines.rows_of(0) == slice(0, 3)
     assert lines.rows_of(1) == slice(3, 5)
-    assert lines.shown(0) == 3.0
-    assert lines.shown(1) == 2.0
+    assert lines.effective_rows(0) == 3.0
+    assert lines.effective_rows(1) == 2.0
 
 
 def test_what_internal_preload_hides_is_not_shown() -> None:
@@ -124,8 +124,8 @@ def test_what_internal_preload_hides_is_not_shown() -> None:
     projection = np.full((2, 2), 0.5)
     per_row = projection / (lines.noise / lines.gamma)
     lines = replace(lines, transform=np.stack((per_row, per_row)))
-    assert lines.shown(0) == pytest.approx(1.0)
-    assert lines.shown(1) == pytest.approx(0.5)
+    assert lines.effective_rows(0) == pytest.approx(1.0)
+    assert lines.effective_rows(1) == pytest.approx(0.5)
 
 
 def test_a_shift_is_that_of_the_fit_without_the_cluster() -> None:
