@@ -314,6 +314,7 @@ def fit_session(context: SessionContext, session: Session) -> Session:
     report = session.folder / REPORT
     with writing(path):
         save_calibration(calibration, path)
+    with writing(report):
         report.mkdir(exist_ok=True)
     context.tools.save_report(closed, changed, calibration, report)
     context.journal.say(Level.INFO, "certificate", page=str(report / PAGE))

@@ -34,6 +34,7 @@ SAMPLE = (
     ("rename", "file of the session", "ENOSPC"),
     ("rename", "controller's file", KILL),
     ("write", "note of the audit log", SHORT),
+    ("mkdir", "folder", "EROFS"),  # of the report, behind a calibration that is written
 )
 
 
