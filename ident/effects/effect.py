@@ -259,11 +259,10 @@ class Effect(ABC):
     def refined(self) -> tuple[str, ...]:
         """Settings that are fitted together with all linear parameters of the model.
 
-        The members of the family are where such a fit begins. By default these are all real
-        settings, where there are two or more: fixed at values that somebody chose, they would leave
-        a residual that other effects explain, and σ would not contain it. Where this is empty, a
-        search refines one setting alone, once the effect was chosen: the first positive real one
-        with a smaller and a larger value in the family, between these two.
+        A search does so once it has chosen the effect, and again in each joint fit; it begins at
+        the best member of the family. By default these are all real settings, where there are two
+        or more: fixed at values that somebody chose, they would leave a residual that other effects
+        explain, and σ would not contain it.
         """
         real = tuple(name for name, value in self.settings.items() if isinstance(value, float))
         if len(real) < 2:
@@ -272,7 +271,12 @@ class Effect(ABC):
 
     @property
     def refined_once_chosen(self) -> tuple[str, ...]:
-        """Settings that are fitted in this way once the effect was chosen, not before."""
+        """Settings that are fitted in this way once the effect was chosen.
+
+        Those that are not in `refined` stay as they are in joint fits. Where this is empty, one
+        setting alone is refined, the first positive real one that has a smaller and a larger value
+        in the family: between these two.
+        """
         return self.refined
 
     @property
