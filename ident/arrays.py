@@ -206,10 +206,20 @@ def require_size(label: str, array: FloatArray, refuse: Refusal, remedy: str) ->
     )
 
 
+def is_whole_number(value: object) -> bool:
+    """Whether it is an integer of Python or numpy; True and False are none."""
+    return isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+
+
+def require_no_flag(label: str, value: object, remedy: str) -> None:
+    """Refuse True and False, as a `ModelError`: to Python they are the numbers 1 and 0."""
+    if isinstance(value, bool):
+        raise ModelError(f"{label} is {value}; expected a number; {remedy}")
+
+
 def require_count(label: str, value: object, *, remedy: str = "give a number such as 0") -> int:
     """Return a whole number, zero or above; refuse others, as a `ModelError`."""
-    is_whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
-    if not is_whole or value < 0:  # type: ignore[operator]
+    if not is_whole_number(value) or value < 0:  # type: ignore[operator]
         raise ModelError(
             f"{label} is {value!r:.60}; expected a whole number, zero or above; {remedy}"
         )

@@ -24,6 +24,7 @@ from ident.arrays import (
     Refusal,
     require_count,
     require_kind,
+    require_no_flag,
     require_number,
 )
 from ident.errors import ModelError
@@ -141,12 +142,9 @@ def require_settings(conditioning: Conditioning) -> None:
         "standstill_share": conditioning.standstill_share,
     }
     for name, value in numbers.items():
-        require_kind(f"{name} of the conditioning", value, Real, "give a number")
-        if isinstance(value, bool):
-            raise ModelError(
-                f"{name} of the conditioning is {value}; expected a number; leave it out if "
-                "you do not know it"
-            )
+        label = f"{name} of the conditioning"
+        require_kind(label, value, Real, "give a number")
+        require_no_flag(label, value, "leave it out if you do not know it")
     if not 0.0 <= conditioning.standstill_share <= 1.0:
         raise ModelError(
             f"standstill_share of the conditioning is {conditioning.standstill_share:g}; expected "

@@ -77,8 +77,8 @@ ColumnCache = dict[tuple[Effect, int], npt.NDArray[np.float32]]
 There are hundreds, and single precision is enough for their trials.
 """
 DECORRELATED_TOGETHER = 16  #: Candidates that are decorrelated at once
-MOVES_WANTED = 60
-SHORTEST_PIECE_S = 0.25
+MOVES_WANTED = 60  #: Number of moves below which moves are cut into pieces
+SHORTEST_PIECE_S = 0.25  #: Five times the correlation time of a residual
 #: Singular value of a candidate's Gram matrix in its own units, relative to the largest, at which
 #: the other folds no longer show that combination of its columns
 SMALLEST_SINGULAR = 1e-9
@@ -524,7 +524,11 @@ def _tried_on_folds(
 ) -> tuple[CandidateTrial, ...]:
     """Test c candidates that the declared model lacks, on moves and on folds.
 
-    See `_scored_together` and `_LeftOut`.
+    Args:
+        folds, before: see `_scored_together`.
+        of_motors: products of the candidates with the rows of each motor.
+        sums: the same, summed over all rows.
+        projection: of the candidates.
     """
     along = projection.along  # w = H⁻¹JᵀΦ, transposed
     # Of each cluster: Φ⊥ᵀΦ⊥ = wᵀJᵀJ w + ΦᵀΦ − ΦᵀJ w − wᵀJᵀΦ, and Φ⊥ᵀe = Φᵀe − wᵀJᵀe.
@@ -564,7 +568,7 @@ def _tried_on_folds(
 
 @dataclass(frozen=True, slots=True)
 class _LeftOut:
-    """Candidates fitted without each fold k, beside a model fitted without it."""
+    """Candidates fitted without each fold k, in a model that is fitted without it, too."""
 
     training_fall: FloatArray  #: fall of ‖e‖² on the other folds, shape (folds, c)
     squares: FloatArray  #: ‖r‖² on the fold, shape (folds, m, c)
@@ -650,7 +654,7 @@ def _shortest_inverse(matrices: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class _Products:
-    """Products, block by block, of the candidates that load one motor with J, Φ, e and r."""
+    """Products with J, Φ, e and r, block by block, of the candidates that load one motor."""
 
     own: MotorRows  #: the motor's rows
     numbers: IntArray  #: of these candidates, c of them, among those of the batch

@@ -86,10 +86,10 @@ usual are some hundredths of a degree.
 LARGEST_ZERO_STD_M = 0.0012  #: The same of a slide whose zero is wrong by 6 mm
 LEAST_DELAY_S = 5e-4  #: Shortest delay of a current that is named: less is a filter of the drive
 LEAST_EARLY_SHARE = Gates().smallest_share
-"""Share of its motor's squared residual that must be explained by the current of one axis alone
-that is early; it is that of any effect of a search.
+"""Share of its motor's squared residual that an early current of a single axis must explain,
+as any effect of a search.
 """
-MOST_ROUNDS = 4  #: Tests one after the other, each beside the mistakes that were found before
+MOST_ROUNDS = 4  #: Tests one after the other, each with the mistakes found before in its model
 LEAST_SETTLED_STD = 0.1
 """Least σ of a correction in the joint fit, relative to the σ of its column to first order.
 
@@ -157,7 +157,7 @@ class _Round:
     evidence: Evidence  #: the fit that it was made on
     problem: SearchProblem
     findings: tuple[Finding, ...]  #: of all corrections, the best first
-    pairs: tuple[PairOfZeros, ...]  #: of zeros, each of which the data show by itself
+    pairs: tuple[PairOfZeros, ...]  #: of zeros that the data each show alone, wrong or not
     settled: _Settled | None  #: what it has found; None for nothing
 
 
@@ -517,7 +517,7 @@ def _first_that_stands(
     """
     for suspect in suspects:
         own = rivals.findings_of(suspect.effects)
-        # It passed among the corrections; among all rivals it must pass again.
+        # It passed among the corrections, and must pass again among all rivals.
         if not suspect.is_pair and not any(found.passed for found in own):
             continue
         best = suspects[0]

@@ -221,7 +221,7 @@ def refuted_by_structure(
         by_name, by_term, by_both = score_candidates(folds, columns, candidates)
         if by_name is None or by_term is None or by_both is None:
             continue
-        # ‖r‖² of each fold; the named effect is judged by this model, not by an earlier turn's.
+        # ‖r‖² of each fold; the named effect with its refined settings, not those of its finding.
         name_errors = by_name.left_out.sum(axis=1)
         term_errors = by_term.left_out.sum(axis=1)
         both_errors = by_both.left_out.sum(axis=1)

@@ -1,8 +1,12 @@
 """The form of an effect: columns of joint torque that the declared model lacks.
 
-An effect adds Σ c_k φ_k to the torque that the motors must supply beside the declared model, in
-joint units. A positive coefficient c with a positive column φ therefore needs more current in the
-positive direction of the joint.
+An effect adds Σ c_k φ_k to the torque of the declared model, which the motors must supply; it is
+given at the joint [Nm; N]. A positive coefficient c with a positive column φ therefore needs more
+current in the positive direction of the joint.
+
+Shapes: m axes, p coefficients, k samples of a run, r rows of all runs. Columns go two steps from
+the effect to the equations: where the effect is placed (`columns_at`), and then as torques of all
+axes (`at_joints`).
 """
 
 from __future__ import annotations
@@ -93,9 +97,9 @@ class Effect(ABC):
     states equation, sign, source and signature: how the residual shows it.
 
     The other properties say where and when it is tried, and what its settings mean; their defaults
-    are those of a torque on one driven joint. No name of a setting or a coefficient has a meaning
-    by itself. A search tries it where a package registers it by the entry point group
-    `drivegain.effects`, or where it is in `own_effects` of `find_effects`.
+    are those of a torque on one driven joint. Settings and coefficients may have any names: only
+    these properties give them a meaning. A search tries it where a package registers it by the
+    entry point group `drivegain.effects`, or where it is in `own_effects` of `find_effects`.
 
     Example::
 
@@ -143,7 +147,7 @@ class Effect(ABC):
 
     @property
     def has_axis(self) -> bool:
-        """Whether it is on an axis; what acts on all alike is placed on the first one."""
+        """Whether it acts on one axis; False of what acts on all, which is placed on the first."""
         return self.side is not GearSide.ALL_MOTORS
 
     @property
@@ -177,18 +181,26 @@ class Effect(ABC):
 
         Of a torque on two joints it is `other_axis`, unless it says otherwise.
         """
-        return "other_axis" if self.side is GearSide.TWO_JOINTS else ""
+        if self.side is GearSide.TWO_JOINTS:
+            return "other_axis"
+        return ""
 
     @property
     def second_axis(self) -> int | None:
         """Number of the other axis, from 1; None where it has none."""
-        if self.axis_setting:
-            return int(self.settings[self.axis_setting]) or None
-        return None
+        if not self.axis_setting:
+            return None
+        number = int(self.settings[self.axis_setting])
+        if number == 0:  # see `AxisNumber`
+            return None
+        return number
 
     @property
     def form_settings(self) -> tuple[str, ...]:
-        """Settings that choose a form of one effect: a search counts two forms as one effect."""
+        """Settings that choose between forms of one effect, such as a switch.
+
+        A search counts two forms as one effect; such a setting is no parameter.
+        """
         return ()
 
     @property
@@ -197,8 +209,8 @@ class Effect(ABC):
 
         All whole numbers that choose no form: cogging of two orders is two effects.
         """
-        whole = (name for name, value in self.settings.items() if isinstance(value, int))
-        return tuple(name for name in whole if name not in self.form_settings)
+        integers = [name for name, value in self.settings.items() if isinstance(value, int)]
+        return tuple(name for name in integers if name not in self.form_settings)
 
     @property
     def added_settings(self) -> tuple[str, ...]:
@@ -212,7 +224,8 @@ class Effect(ABC):
     def nearly_declared(self) -> Mapping[str, Range]:
         """Values of a setting, by its name, with which the effect is nearly a term of the model.
 
-        A refinement stays outside of them, on the side where it begins.
+        A refinement of the setting stays outside of this range, and on the side of it where it
+        begins.
         """
         return {}
 
@@ -225,8 +238,8 @@ class Effect(ABC):
     def has_rotor_form(self) -> bool:
         """Whether it is a loss at a gear that can leave the rotor out of the load (`rotor`).
 
-        Its settings `rotor_inertia_kg_m2` and `with_rotor` are then J, and 1 where the rest of it
-        is fitted.
+        It then has the settings `rotor_inertia_kg_m2`, the known part J of the rotor's inertia Ia,
+        and `with_rotor`, 1 where a coefficient for the rest Ia − J is fitted, else 0.
         """
         return False
 
@@ -244,32 +257,38 @@ class Effect(ABC):
 
     @property
     def refined(self) -> tuple[str, ...]:
-        """Settings that are fitted with the whole model; the family has the values to begin at.
+        """Settings that are fitted together with all linear parameters of the model.
 
-        All real settings where it has two or more: kept at a value that somebody gave, they would
-        leave a rest that other effects explain, and σ would not know it. Without names here, the
-        first positive one that has smaller and larger values in the family is refined between them,
-        once it was chosen.
+        A search does so once it has chosen the effect, and again in each joint fit; it begins at
+        the best member of the family. By default these are all real settings, where there are two
+        or more: fixed at values that somebody chose, they would leave a residual that other effects
+        explain, and σ would not contain it.
         """
         real = tuple(name for name, value in self.settings.items() if isinstance(value, float))
-        return real if len(real) > 1 else ()
+        if len(real) < 2:
+            return ()
+        return real
 
     @property
     def refined_once_chosen(self) -> tuple[str, ...]:
-        """Settings that are fitted with the whole model once the effect was chosen."""
+        """Settings that are fitted in this way once the effect was chosen.
+
+        Those that are not in `refined` stay as they are in joint fits. Where this is empty, one
+        setting alone is refined, the first positive real one that has a smaller and a larger value
+        in the family: between these two.
+        """
         return self.refined
 
     @property
     def is_rate(self) -> bool:
         """Whether the torque is a derivative in time, which a filter makes much smaller."""
-        return self.side is GearSide.ALL_JOINTS or self.declares in {
-            Property.RATE_OF_TORQUE,
-            Property.RATE_OF_LOAD,
-        }
+        if self.side is GearSide.ALL_JOINTS:
+            return True
+        return self.declares in {Property.RATE_OF_TORQUE, Property.RATE_OF_LOAD}
 
     @property
     def reach(self) -> int | None:
-        """How many joints further along the robot the other of a pair may be; None for any."""
+        """Largest distance of the second axis of a pair, in axes along the robot; None for any."""
         return None
 
     @property
@@ -279,7 +298,7 @@ class Effect(ABC):
 
     @property
     def forms(self) -> tuple[Self, ...]:
-        """Simpler forms, then the effect itself; columns of each are the first of the next."""
+        """Simpler forms, then the effect itself; each has the first columns of the next one."""
         return (self,)
 
     @abstractmethod
@@ -306,8 +325,8 @@ class FadingEffect(Effect):
     """An effect that fades with time, or settles."""
 
     time_constant_s: Annotated[float, Range(1e-2, 1e6)]  #: η
-    #: 1 where t counts from the first run of the session, 0 where from the beginning of each run,
-    #: as after a power-on.
+    #: 1: t counts from the first run of the session. 0: from the beginning of each run, as after a
+    #: power-on.
     whole_session: Switch
 
     def fits_in(self, runs: Sequence[Signals], axis: int) -> bool:
@@ -316,7 +335,7 @@ class FadingEffect(Effect):
         return self.time_constant_s <= watched_s(runs, whole_session=bool(self.whole_session))
 
     def left(self, signals: Signals) -> FloatArray:
-        """What is left of it, e^(−t/η), shape (k,)."""
+        """Share that is left of the effect, e^(−t/η), shape (k,)."""
         if self.whole_session:
             time_s = signals.session_s
         else:
@@ -339,7 +358,7 @@ def setting_range(effect: Effect, setting: str) -> Range:
 def setting_kind(effect: Effect, setting: str) -> type:
     """Return the type of a setting, as annotated: int, or float for one that can be refined."""
     hint = get_type_hints(type(effect), include_extras=True)[setting]
-    kind: type = get_args(hint)[0]
+    kind: type = get_args(hint)[0]  # of Annotated[kind, Range(…)]
     return kind
 
 
@@ -410,10 +429,7 @@ class PlacedEffect:
     axis: int  #: index; joints without a motor follow the axes (`Robot.places`)
 
     def axis_name(self, axes: Sequence[str]) -> str:
-        """Name of its axis; ALL_AXES of what acts on every axis alike.
-
-        That is placed on the first axis for order only.
-        """
+        """Name of its axis; ALL_AXES of an effect on every axis, which is placed on the first."""
         if not self.effect.has_axis:
             return ALL_AXES
         return axes[self.axis]
@@ -434,7 +450,8 @@ class PlacedEffect:
         """
         settings: list[str] = []
         for setting, value in self.effect.settings.items():
-            if value or setting not in self.effect.added_settings:
+            is_left_out = value == 0 and setting in self.effect.added_settings
+            if not is_left_out:
                 settings.append(f"{setting} {value:.6g}")
         suffix = f"{self.axis + 1}"
         if settings:
@@ -447,9 +464,9 @@ class PlacedEffect:
 
 
 def effect_key(effect: Effect, axis: int) -> EffectKey:
-    """Identify an effect on an axis by its family and `Effect.key_settings`.
+    """Key of an effect on an axis: two effects with one key cannot be in one model.
 
-    Two orders of a ripple are two.
+    It has the family, the axis and the `Effect.key_settings`: ripples of two orders are two.
     """
     settings = effect.settings
     key_settings = tuple(settings[name] for name in effect.key_settings)
@@ -464,9 +481,9 @@ def effect_torque(
     conditioning: Conditioning,
     model: Model,
 ) -> FloatArray:
-    """An effect's columns as joint torques on the observation's rows, shape (m, p, r).
+    """An effect's columns as torques of all axes on the observation's rows, shape (m, p, r).
 
-    In Nm per unit of each coefficient.
+    They are in Nm (or N) per unit of each coefficient.
     """
     columns = effect_columns(effect, axis, runs, datasets, conditioning)
     return at_joints(effect, axis, columns, model.drive_train)
@@ -479,10 +496,10 @@ def effect_columns(
     datasets: Sequence[Dataset],
     conditioning: Conditioning,
 ) -> FloatArray:
-    """An effect's columns where it is placed, on the observation's rows.
+    """An effect's columns where it is placed, filtered and decimated to the observation's rows.
 
     Returns:
-        shape (p, r) or (joints, p, r).
+        shape (p, r) on one joint or motor; (2, p, r) on two joints; (m, p, r) on all.
     """
     parts: list[FloatArray] = []
     for run, data in zip(runs, datasets, strict=True):
@@ -497,22 +514,29 @@ def is_shipped(effect: Effect) -> bool:
 
 
 def columns_at(effect: Effect, signals: Signals, axis: int) -> FloatArray:
-    """Columns of an effect where it is placed.
+    """Columns of an effect where it is placed, along a run.
 
-    On a joint without a motor they are torques of all axes, shape (m, p, k).
+    Args:
+        effect: in Nm (or N) per unit of each coefficient.
+        signals: of the run.
+        axis: index; places without a motor follow the m axes (`Robot.places`).
+
+    Returns:
+        shape (p, k), (2, p, k) or (m, p, k), see `Effect.columns`; of a place without a motor the
+        torques of all axes that the same power needs, shape (m, p, k).
 
     Raises:
         EffectRefused: an effect of one's own fails, or returns columns of another shape or a number
             that is not finite.
     """
-    count = len(signals.current_a)
+    axis_count = len(signals.current_a)
     if is_shipped(effect):
         columns = effect.columns(signals, axis)
     else:
-        columns = _own_columns(effect, signals, axis, count)
-    if axis < count:
+        columns = _own_columns(effect, signals, axis, axis_count)
+    if axis < axis_count:
         return columns
-    leverage = signals.leverage[axis - count]
+    leverage = signals.leverage[axis - axis_count]  # torque of each axis per unit there, (m, k)
     return np.asarray(leverage[:, None] * columns)
 
 
@@ -533,11 +557,11 @@ def fits_data(effect: Effect, runs: Sequence[Signals], axis: int) -> bool:
         ) from error
 
 
-_SHAPES = {GearSide.JOINT: (), GearSide.MOTOR: (), GearSide.TWO_JOINTS: (2,)}
-"""Shape of an effect's columns before (p, k), by where the torque acts; (m,) elsewhere."""
+_LEADING_SHAPE = {GearSide.JOINT: (), GearSide.MOTOR: (), GearSide.TWO_JOINTS: (2,)}
+"""Leading axes of the columns, before (p, k), by where the torque acts; (m,) where on all."""
 
 
-def _own_columns(effect: Effect, signals: Signals, axis: int, count: int) -> FloatArray:
+def _own_columns(effect: Effect, signals: Signals, axis: int, axis_count: int) -> FloatArray:
     """Columns of an effect of one's own; refused where it fails, or they have no use.
 
     Their shape must be right and their numbers finite.
@@ -557,8 +581,8 @@ def _own_columns(effect: Effect, signals: Signals, axis: int, count: int) -> Flo
         found = np.asarray(returned, dtype=np.float64)
     except (TypeError, ValueError, OverflowError) as error:
         raise EffectRefused(f"{label}: found no numbers ({error})") from error
-    ahead = _SHAPES.get(effect.side, (count,))
-    expected = (*ahead, len(effect.coefficients), len(signals.time_s))
+    leading = _LEADING_SHAPE.get(effect.side, (axis_count,))
+    expected = (*leading, len(effect.coefficients), len(signals.time_s))
     if found.shape != expected:
         raise EffectRefused(
             f"effect {effect.name!r}: found columns of shape {found.shape}; expected {expected}, "
@@ -576,11 +600,18 @@ def _own_columns(effect: Effect, signals: Signals, axis: int, count: int) -> Flo
 def at_joints(
     effect: Effect, axis: int, columns: FloatArray, drive_train: DriveTrain
 ) -> FloatArray:
-    """Convert an effect's columns to torques of all axes.
+    """Convert an effect's columns where it is placed to torques of all axes.
 
-    They have the shape (p, k) or (joints, p, k), and (m, p, k) then.
+    Args:
+        effect: the effect.
+        axis: index of its place.
+        columns: as of `columns_at`, shape (p, k), (2, p, k) or (m, p, k).
+        drive_train: R.
+
+    Returns:
+        shape (m, p, k).
     """
-    if axis >= len(drive_train.ratio):
+    if axis >= len(drive_train.ratio):  # a place without a motor: `columns_at` has converted them
         return columns
     if effect.side is GearSide.MOTOR:
         direction = drive_train.direction[axis]
@@ -588,6 +619,7 @@ def at_joints(
     if effect.side is GearSide.ALL_JOINTS:
         return columns
     if effect.side is GearSide.ALL_MOTORS:
+        # τ_j = Σ_i r_ij τ_i of motor i and joint j
         return np.asarray(np.einsum("ij,ipk->jpk", drive_train.direction, columns))
     joints = [axis]
     if effect.side is GearSide.TWO_JOINTS and effect.second_axis is not None:
@@ -599,7 +631,8 @@ def at_joints(
 
 def is_placeable(effect: Effect, axis: int, robot: Robot) -> bool:
     """Whether an effect can act on an axis; one of two joints is placed on the lower number."""
-    if effect.with_motor != (axis < robot.axis_count):
+    is_driven = axis < robot.axis_count
+    if effect.with_motor != is_driven:
         return False
     if effect.needs_revolute and robot.places[axis].kind is JointKind.PRISMATIC:
         return False
@@ -607,14 +640,17 @@ def is_placeable(effect: Effect, axis: int, robot: Robot) -> bool:
         return False
     if not effect.has_axis:
         return axis == 0
-    return effect.side is not GearSide.TWO_JOINTS or _is_pair(effect, axis, robot)
+    if effect.side is GearSide.TWO_JOINTS:
+        return _is_pair(effect, axis, robot)
+    return True
 
 
 def _is_pair(effect: Effect, axis: int, robot: Robot) -> bool:
     """Whether the other axis of an effect of two joints comes behind this one, within its reach."""
-    other_axis = effect.second_axis
-    if other_axis is None:
+    number = axis + 1
+    other = effect.second_axis
+    if other is None:
         return False
-    if effect.reach is not None and other_axis > axis + 1 + effect.reach:
+    if effect.reach is not None and other > number + effect.reach:
         return False
-    return axis + 1 < other_axis <= robot.axis_count
+    return number < other <= robot.axis_count

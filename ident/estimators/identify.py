@@ -101,13 +101,16 @@ def identify(
     if axes is None:
         axes = [joint.name for joint in model.robot.axes]
     require_names("axes", axes, model.robot.axis_count)
-    used = with_signed_currents(runs, model, conditioning, axes)
     instants: list[Instants] = []
     channels: list[RunChannels] = []
     kept: list[BuiltRun] = []
     needs_instruments = method is Method.IV
-    has_instruments = needs_instruments and not model.is_redundant
-    built = rows_of_runs(model, used, conditioning, instruments=has_instruments)
+    # `iv` refuses a redundant drive itself, which has no equation for one motor.
+    builds_instruments = needs_instruments and not model.is_redundant
+    # Each of these is a generator around the one before. Nothing is read before `reduce_built` asks
+    # for a run, and a run passes all of them before the next one is read.
+    signed = with_signed_currents(runs, model, conditioning, axes)
+    built = rows_of_runs(model, signed, conditioning, instruments=builds_instruments)
     built = noting_channels(built, model, axes, channels)
     built = noting_instants(built, model, conditioning, instants)
     if keep_rows:
@@ -119,24 +122,24 @@ def identify(
         )
     require_moved(standard, axes)
     system = regrouped(standard)
-    del standard  # its clusters hold every column
+    del standard  # its clusters have a column for every standard parameter: large
     with with_unit_causes(channels, model, axes), with_channel_causes(channels, axes):
         estimate = _checked_estimate(system, method, known_gains, axes, judge=judge)
-    left_out = each_run(holdout, seen, system.payloads)
-    left_out = with_signed_currents(left_out, model, conditioning, axes)
-    built = rows_of_runs(model, left_out, conditioning)
-    built = noting_channels(built, model, axes, [])
+    held_out = each_run(holdout, seen, system.payloads)
+    signed = with_signed_currents(held_out, model, conditioning, axes)
+    built = rows_of_runs(model, signed, conditioning)
+    built = noting_channels(built, model, axes, [])  # refused as those of the fit, not reported
     if keep_rows:
-        built = keeping(built, kept)
-    rest = reduce_built(model, built, payloads=system.payloads)
-    unseen: System | None = None
-    if rest.runs:
-        unseen = regrouped(rest, system.base, system.payload_columns)
+        built = keeping(built, kept)  # behind the runs of the fit
+    standard = reduce_built(model, built, payloads=system.payloads)
+    holdout_system: System | None = None
+    if standard.runs:
+        holdout_system = regrouped(standard, system.base, system.payload_columns)
     found = Identification(
         model,
         conditioning,
         system,
-        unseen,
+        holdout_system,
         estimate,
         channels=tuple(channels),
         instants=tuple(instants),
@@ -174,8 +177,9 @@ def _checked_estimate(
     estimate = estimate_with(method, system, fixed_gains)
     jackknifed = estimate
     if fixed_gains is None:
-        # The deviations of the linear estimates are those of independent rows (eqs. 10, 23) and
-        # do not see that moves contradict each other; ml's do, where it has an estimate.
+        # σ of the linear estimates is that of independent rows (eqs. 10, 23), which does not see
+        # that moves contradict each other. The σ of ml does, as it is by leaving out moves: the
+        # checks below use it, where ml has an estimate.
         if not method.is_of_currents:
             with suppress(IdentificationError):
                 jackknifed = ml(system)
@@ -184,8 +188,8 @@ def _checked_estimate(
         require_weight(system, estimate)
         require_signs(system, estimate, axes)
     if judge:
-        size, left = joint_torques(system, estimate)
-        idle = idle_joints(system.model, size, left)
+        torque_sizes, residual_sizes = joint_torques(system, estimate)
+        idle = idle_joints(system.model, torque_sizes, residual_sizes)
         error = estimate.relative_error(system)
         require_plausible(jackknifed, error, axes, idle)
     return estimate
@@ -226,17 +230,17 @@ def _without_limited_currents(
     kept = tuple(without_limited(data, limits) for data in datasets)
     rows = [tuple(rows_of(model, data, conditioning)) for data in kept]
     built = list(zip(kept, rows, strict=True))
-    fit_runs = len(found.channels)
-    standard = reduce_built(model, built[:fit_runs], instruments=method is Method.IV)
+    fit_count = len(found.channels)  # channels are of the runs of the fit alone
+    standard = reduce_built(model, built[:fit_count], instruments=method is Method.IV)
     system = regrouped(standard)
     holdout = found.holdout
     if holdout is not None:
-        rest = reduce_built(model, built[fit_runs:], payloads=system.payloads)
-        holdout = regrouped(rest, system.base, system.payload_columns)
+        held_out = reduce_built(model, built[fit_count:], payloads=system.payloads)
+        holdout = regrouped(held_out, system.base, system.payload_columns)
     estimate = estimate_with(method, system, fixed_gains)
     observation = observe(model, kept, conditioning, system, rows)
     channels: list[RunChannels] = []
-    for of_run, data in zip(found.channels, datasets[:fit_runs], strict=True):
+    for of_run, data in zip(found.channels, datasets[:fit_count], strict=True):
         channels.append(noting_limits(of_run, data, limits))
     return replace(
         found,
@@ -257,8 +261,9 @@ def require_moved(standard: System, axes: Sequence[str]) -> None:
     Raises:
         JointStill: for this joint.
     """
-    for axis, rows in enumerate(standard.joints.rows[: len(axes)]):
-        if not rows:
+    row_counts = standard.joints.rows[: len(axes)]
+    for axis, row_count in enumerate(row_counts):
+        if not row_count:
             found = f"{axes[axis]} never moves above its standstill speed in any run"
             raise JointStill(", ".join(standard.runs), (axes[axis],), found)
 
@@ -332,8 +337,8 @@ def with_signed_currents(
 ) -> Iterator[Run]:
     """Yield runs, and refuse one in which drives report the size of the current only.
 
-    A run is judged when the next one is asked for: it has been differentiated then, which refuses
-    what is no recording.
+    A run is judged after it was yielded, when the next one is asked for. It has been differentiated
+    by then, which refuses what is no recording, in words that fit better.
     """
     for run in runs:
         yield run

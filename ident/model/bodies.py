@@ -21,7 +21,7 @@ from numbers import Real
 
 import numpy as np
 
-from ident.arrays import LARGEST_NUMBER, FloatArray, as_float, require_kind
+from ident.arrays import LARGEST_NUMBER, FloatArray, as_float, require_kind, require_no_flag
 from ident.errors import ModelError
 
 LOADED = "_loaded"
@@ -62,8 +62,7 @@ class Payload:
         for name, value in self.known.items():
             remedy = "give numbers in SI units: {'m': 4.59}"
             require_kind(f"known[{name!r}]", value, Real, remedy)
-            if isinstance(value, bool):
-                raise ModelError(f"known[{name!r}] is {value}; expected a number; {remedy}")
+            require_no_flag(f"known[{name!r}]", value, remedy)
         foreign = sorted(set(self.known) - set(LINK_PARAMETERS))
         if foreign:
             found = ", ".join(map(repr, foreign))
@@ -72,12 +71,9 @@ class Payload:
                 f"payload {self.name!r} has the known parameters {found}; expected names among "
                 f"{expected}; write its mass as {{'m': 4.59}}"
             )
-        require_kind(
-            "mass_tolerance_kg", self.mass_tolerance_kg, Real, "give kilograms, such as 0.01"
-        )
-        if isinstance(self.mass_tolerance_kg, bool):
-            found = f"mass_tolerance_kg is {self.mass_tolerance_kg}"
-            raise ModelError(f"{found}; expected a number; give kilograms, such as 0.01")
+        remedy = "give kilograms, such as 0.01"
+        require_kind("mass_tolerance_kg", self.mass_tolerance_kg, Real, remedy)
+        require_no_flag("mass_tolerance_kg", self.mass_tolerance_kg, remedy)
         tolerance_kg = as_float(self.mass_tolerance_kg)
         if not 0.0 <= tolerance_kg <= LARGEST_NUMBER:
             found = f"a mass tolerance of {tolerance_kg:g} kg"

@@ -13,7 +13,9 @@ of the tree and its closure; Khalil & Dombre, Modeling, Identification and Contr
 7.)
 
 Rows of φ that are lengths are divided by the size of the robot: a condition number then compares
-like with like.
+like with like. J_d is factorised once, J_d = Q R, and solves for G_d and h_d:
+
+    G_d = −R⁻¹ Qᵀ J_x,    h_d = −R⁻¹ Qᵀ J̇ q̇.
 """
 
 from __future__ import annotations
@@ -29,12 +31,15 @@ from ident.model.closures import loops, origin, with_followers
 from ident.model.robot import Closure, JointKind, Motion, Robot, poses
 
 LARGEST_CONDITION = 500.0
-"""Largest condition (Frobenius) of J_d, the derivatives to the joints that follow,
-and of A for a redundant drive; mechanisms stay below 30 in their workspace.
+"""Largest condition number (Frobenius) of J_d, the derivatives to the joints that follow, and of A
+for a redundant drive: nearer to a singularity, small errors of position are large forces.
+Mechanisms stay below 30 in their workspace.
 """
 CLOSED = 1e-12  #: |φ| at which Newton's iteration ends, in units of the robot's size or radians
-#: The same on the way to other positions: one more step of Newton leaves its square
+#: The same on the way to other positions: Newton's next step would leave about its square, 1e-8
 NEARLY_CLOSED = 1e-4
+SETTLED_RAD = 1e-9  #: Longest last step of a Newton iteration [rad or m]
+NEARLY_SETTLED_RAD = 1e-3  #: The same on the way to other positions [rad or m]
 SMALLEST_RANK = 1e-7  #: Singular value of J, relative to the largest, that counts as zero
 LARGEST_GAP = 0.3  #: |φ| at the declared assembly pose, in units of the robot's size or radians
 LARGEST_MISFIT = 0.02
@@ -43,13 +48,14 @@ fits all of them best [rad, or m divided by the robot's size]: a bent arm stays 
 zero or sign does not.
 """
 LONGEST_STRIDE = 64
-"""At least every 64th sample is reached from the assembly pose;
+"""At least every 64th sample is reached from the assembly pose, in steps;
 the others start from their neighbours.
 """
 #: Largest motion between two such samples [rad, or m divided by the robot's size]
 STRIDE_RAD = 0.25
-STEP_RAD = 0.15  #: Longest step on that way [rad, or m divided by the robot's size]
-LONGEST_STEP_RAD = 1.5  #: Longer steps of Newton lead to another pose, or nowhere
+#: Longest step on the way from the assembly pose [rad, or m divided by the robot's size]
+STEP_RAD = 0.15
+LONGEST_STEP_RAD = 1.5  #: Longer steps of Newton lead to another pose, or nowhere [rad or m]
 MAX_ITERATIONS = 30
 SMALLEST_SIZE_M = 1e-3  #: Of a robot
 
@@ -106,8 +112,8 @@ def assemble(robot: Robot, mobility: int | None = None) -> Assembly:
     size_m = _size(robot, start)
     position = _closed_near(robot, start, size_m)
     jacobian = loops(robot, position[None], size_m).jacobian[0]
-    free = null_space(jacobian)
-    found = free.shape[1]
+    free_motions = null_space(jacobian)
+    found = free_motions.shape[1]
     if mobility is not None and found != mobility:
         raise ModelError(
             f"the closures leave {found} degrees of freedom at the assembly pose; expected "
@@ -115,10 +121,10 @@ def assemble(robot: Robot, mobility: int | None = None) -> Assembly:
             "be free (`directions`)?"
         )
     motors = robot.axis_joints
-    _require_driven(robot, position, free, size_m)
+    _require_driven(robot, position, free_motions, size_m)
     independent = motors
-    if len(motors) != found:
-        independent = _independent(free)
+    if len(motors) != found:  # a redundant drive: any d joints that move independently are x
+        independent = _independent(free_motions)
     dependent = tuple(joint for joint in joints if joint not in independent)
     condition = 1.0
     if dependent:
@@ -188,26 +194,27 @@ def follow(robot: Robot, assembly: Assembly, axes: Motion) -> TreeMotion:
         return TreeMotion(axes, identity, identity, np.ones(samples))
     position = positions(robot, assembly, axes_rad)
     jacobian = loops(robot, position, assembly.size_m).jacobian
-    # J_d = Q R, so that G_d = −R⁻¹ Qᵀ J_x
+    # G: the identity in the rows of x, G_d = −R⁻¹ Qᵀ J_x in the others.
     q, r = np.linalg.qr(jacobian[:, :, dependent])
-    transposed = np.swapaxes(q, 1, 2)
-    right = transposed @ jacobian[:, :, x]
+    projected_x = np.swapaxes(q, 1, 2) @ jacobian[:, :, x]
     to_joints = np.zeros((samples, count, len(x)))
     to_joints[:, x] = np.eye(len(x))
-    to_joints[:, dependent] = -np.linalg.solve(r, right)
+    to_joints[:, dependent] = -np.linalg.solve(r, projected_x)
+    # ẋ by q̇_a = A ẋ, and q̇ = G ẋ.
     to_motors = to_joints[:, motors]
-    speed_x = _least_squares(to_motors, np.asarray(axes.velocity_rad_s))
-    velocity = np.einsum("knd,kd->kn", to_joints, speed_x)  # G ẋ
-    # h_d = −R⁻¹ Qᵀ J̇ q̇
-    turning = loops(robot, position, assembly.size_m, velocity).bias
-    turning_right = np.einsum("kcr,kc->kr", q, turning)
-    solution = np.linalg.solve(r, turning_right[..., None])
-    bias = np.zeros((samples, count))
-    bias[:, dependent] = -solution[..., 0]
-    axes_acceleration = np.asarray(axes.acceleration_rad_s2) - bias[:, motors]
-    acceleration_x = _least_squares(to_motors, axes_acceleration)
+    velocity_x = _least_squares(to_motors, np.asarray(axes.velocity_rad_s))
+    velocity = np.einsum("knd,kd->kn", to_joints, velocity_x)
+    # h_d = −R⁻¹ Qᵀ J̇ q̇.
+    loop_bias = loops(robot, position, assembly.size_m, velocity).bias  # J̇ q̇
+    projected_bias = np.einsum("kcr,kc->kr", q, loop_bias)
+    bias_of_dependent = np.linalg.solve(r, projected_bias[..., None])
+    bias = np.zeros((samples, count))  # h
+    bias[:, dependent] = -bias_of_dependent[..., 0]
+    # ẍ by q̈_a = A ẍ + h_a, and q̈ = G ẍ + h.
+    axes_without_bias = np.asarray(axes.acceleration_rad_s2) - bias[:, motors]
+    acceleration_x = _least_squares(to_motors, axes_without_bias)
     without_bias = np.einsum("knd,kd->kn", to_joints, acceleration_x)
-    acceleration = without_bias + bias  # G ẍ + h
+    acceleration = without_bias + bias
     condition = _condition(r)
     condition_of_motors = _condition_of_motors(robot, assembly, to_motors)
     _require_regular(robot, axes_rad, condition, "closures")
@@ -251,9 +258,15 @@ class Reach:
 
 
 def positions(robot: Robot, assembly: Assembly, axes_rad: FloatArray) -> FloatArray:
-    """Positions of all joints, (k, n), of those of the motors' joints, (k, m); see `follow`.
+    """Positions of all joints [rad or m] from those of the motors' joints; see `follow`.
 
-    In rad or m.
+    Args:
+        robot: with n joints and m motors.
+        assembly: of the robot.
+        axes_rad: positions of the motors' joints, shape (k, m).
+
+    Returns:
+        shape (k, n).
 
     Raises:
         ModelError: the loops cannot be closed at a position, or motors of a redundant drive do not
@@ -264,8 +277,7 @@ def positions(robot: Robot, assembly: Assembly, axes_rad: FloatArray) -> FloatAr
     motors = list(robot.axis_joints)
     difference = np.abs(found.position_rad[:, motors] - axes_rad)
     misfit = difference / units  # zero where m = d
-    largest = int(np.argmax(misfit))
-    worst, axis = divmod(largest, misfit.shape[1])
+    worst, axis = divmod(int(np.argmax(misfit)), misfit.shape[1])  # sample and axis
     if misfit[worst, axis] > LARGEST_MISFIT:
         name = robot.axes[axis].name
         unit = units[axis]
@@ -290,12 +302,15 @@ def positions(robot: Robot, assembly: Assembly, axes_rad: FloatArray) -> FloatAr
 
 
 def _units(robot: Robot, assembly: Assembly) -> FloatArray:
-    """A radian, or the robot's size, of each motor's joint, shape (m,)."""
+    """What a misfit of each motor's joint is compared with, shape (m,).
+
+    A radian where it is revolute, the robot's size where it is prismatic.
+    """
     return _unit_of_each(robot, robot.axis_joints, assembly.size_m)
 
 
 def _unit_of_each(robot: Robot, joints: Sequence[int], size_m: float) -> FloatArray:
-    """A radian of each revolute joint, the robot's size of each prismatic one."""
+    """The same of some joints, by their indices."""
     units: list[float] = []
     for joint in joints:
         if robot.joints[joint].kind is JointKind.REVOLUTE:
@@ -306,7 +321,10 @@ def _unit_of_each(robot: Robot, joints: Sequence[int], size_m: float) -> FloatAr
 
 
 def _condition(triangle: FloatArray) -> FloatArray:
-    """Condition by the Frobenius norm of a triangle in each sample, shape (k,)."""
+    """Condition number ‖R‖ ‖R⁻¹‖ of a triangle in each sample, by the Frobenius norm, shape (k,).
+
+    It is at least that by singular values, and needs none.
+    """
     inverse = _solve_each(triangle, np.eye(triangle.shape[-1]))
     norm = np.linalg.norm(triangle, axis=(1, 2))
     inverse_norm = np.linalg.norm(inverse, axis=(1, 2))
@@ -336,7 +354,11 @@ def _at(robot: Robot, axes_rad: FloatArray) -> str:
 
 
 def reach(robot: Robot, assembly: Assembly, axes_rad: FloatArray) -> Reach:
-    """Close the loops at positions of the motors' joints [rad or m], (k, m), as far as they do."""
+    """Close the loops at positions of the motors' joints [rad or m], (k, m), as far as they do.
+
+    First some coarse samples go from the assembly pose to their positions in small steps. Then
+    finer and finer ones start between those that are closed already.
+    """
     samples = len(axes_rad)
     if not robot.is_constrained:
         no_gap = np.zeros(samples)
@@ -347,8 +369,8 @@ def reach(robot: Robot, assembly: Assembly, axes_rad: FloatArray) -> Reach:
     units = _units(robot, assembly)
     steps_of_samples = np.abs(np.diff(axes_rad, axis=0)) / units
     largest_step = float(np.max(steps_of_samples, initial=0.0))
-    longest = int(STRIDE_RAD / max(largest_step, 1e-9))
-    stride = min(LONGEST_STRIDE, max(1, longest))
+    allowed_stride = int(STRIDE_RAD / max(largest_step, 1e-9))
+    stride = min(LONGEST_STRIDE, max(1, allowed_stride))
     coarse = _every(stride, samples)
     goal = axes_rad[coarse]
     distances = np.abs(goal - start) / units
@@ -359,9 +381,9 @@ def reach(robot: Robot, assembly: Assembly, axes_rad: FloatArray) -> Reach:
     condition = np.full(len(coarse), assembly.condition)
     for step in range(1, steps + 1):
         # On the way, motors of a redundant drive need not fit each other.
-        way = start + (goal - start) * (step / steps)
+        waypoint = start + (goal - start) * (step / steps)
         is_on_the_way = step < steps
-        found, gap, condition = _newton(robot, assembly, found, way, on_the_way=is_on_the_way)
+        found, gap, condition = _newton(robot, assembly, found, waypoint, on_the_way=is_on_the_way)
     while len(coarse) < samples:
         stride = max(1, stride // 8)
         finer = _every(stride, samples)
@@ -412,16 +434,26 @@ def _newton(
     *,
     on_the_way: bool = False,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Close the loops at given positions of the motors' joints, from near by.
+    """Close the loops at given positions of the motors' joints, from near by (Newton's method).
 
-    It returns positions, gaps and conditions. ``on_the_way`` to other positions it is enough to
-    stay near the pose.
+    A step is −J_d⁻¹ φ of the joints that follow. With a redundant drive, x moves as well, so that
+    the motors' joints come as close to their positions as least squares allow (Gauss-Newton).
+
+    Args:
+        robot: with n joints and m motors.
+        assembly: of the robot.
+        position: of all joints, near the poses, shape (k, n).
+        axes_rad: positions of the motors' joints, shape (k, m).
+        on_the_way: to other positions, where it is enough to stay near the pose.
+
+    Returns:
+        positions, shape (k, n), gaps |φ| before the last step, and conditions of J_d, shape (k,).
     """
     largest_gap = CLOSED
-    longest_step_rad = 1e-9
+    longest_step_rad = SETTLED_RAD
     if on_the_way:
         largest_gap = NEARLY_CLOSED
-        longest_step_rad = 1e-3
+        longest_step_rad = NEARLY_SETTLED_RAD
     motors = list(robot.axis_joints)
     x = list(assembly.independent)
     dependent = list(assembly.dependent)
@@ -434,25 +466,24 @@ def _newton(
     for _ in range(MAX_ITERATIONS):
         closing = loops(robot, position, assembly.size_m)
         gap = np.max(np.abs(closing.residual), axis=1)
-        # −J_d⁻¹ [φ | J_x]: the step that closes the loops, and G_d
+        # −J_d⁻¹ [φ | J_x] = −R⁻¹ Qᵀ [φ | J_x]: the step that closes the loops, and G_d.
         q, r = np.linalg.qr(closing.jacobian[:, :, dependent])
         residual = closing.residual[:, :, None]
-        of_independent = closing.jacobian[:, :, x]
-        right = np.concatenate((residual, of_independent), axis=2)
-        turned_right = np.swapaxes(q, 1, 2) @ right
-        solution = -_solve_each(r, turned_right)
+        jacobian_x = closing.jacobian[:, :, x]
+        right = np.concatenate((residual, jacobian_x), axis=2)
+        projected = np.swapaxes(q, 1, 2) @ right
+        solution = -_solve_each(r, projected)
         change = np.zeros_like(position)
         change[:, dependent] = solution[:, :, 0]
         if is_redundant:
             to_joints = np.zeros((samples, count, len(x)))
             to_joints[:, x] = np.eye(len(x))
             to_joints[:, dependent] = solution[:, :, 1:]
-            closed = position[:, motors]
-            misfit = axes_rad - closed - change[:, motors]
+            misfit = axes_rad - position[:, motors] - change[:, motors]
             change_x = _least_squares(to_joints[:, motors], misfit)
             change += np.einsum("knd,kd->kn", to_joints, change_x)  # G Δx
         step = np.max(np.abs(change), axis=1)
-        # Where there is no pose, Newton's steps become longer and longer
+        # Where there is no pose, Newton's steps become longer and longer, or NaN: not "step >= …".
         is_lost = ~(step < LONGEST_STEP_RAD)
         change[is_lost] = 0.0
         position += change
@@ -465,18 +496,30 @@ def _newton(
 
 
 def _between(coarse: IntArray, found: FloatArray, finer: IntArray) -> FloatArray:
-    """Positions between known samples, (len(finer), n), by cubics with slopes of differences."""
+    """Positions between known samples by cubic Hermite splines, shape (len(finer), n).
+
+    Between q_0 and q_1 with slopes q̇_0 and q̇_1 of central differences, at a distance l and with s
+    from 0 to 1:
+
+        q = (1 − s) q_0 + s q_1 + s (1 − s) ((1 − s) a + s b),
+        a = l q̇_0 + (q_0 − q_1),    b = −l q̇_1 − (q_0 − q_1).
+
+    Args:
+        coarse: indices of the known samples.
+        found: their positions, shape (len(coarse), n).
+        finer: indices of the wanted samples.
+    """
     slope = np.gradient(found, coarse, axis=0)
-    before = np.searchsorted(coarse, finer, side="right") - 1
-    before = np.clip(before, 0, len(coarse) - 2)
-    after = before + 1
-    length = (coarse[after] - coarse[before])[:, None]
-    s = (finer - coarse[before])[:, None] / length
-    first = found[before]
-    second = found[after]
+    left = np.searchsorted(coarse, finer, side="right") - 1
+    left = np.clip(left, 0, len(coarse) - 2)
+    right = left + 1
+    length = (coarse[right] - coarse[left])[:, None]
+    s = (finer - coarse[left])[:, None] / length
+    first = found[left]
+    second = found[right]
     difference = first - second
-    a = slope[before] * length + difference
-    b = -slope[after] * length - difference
+    a = slope[left] * length + difference
+    b = -slope[right] * length - difference
     straight = (1 - s) * first + s * second
     bend = (1 - s) * a + s * b
     return np.asarray(straight + s * (1 - s) * bend)
@@ -488,7 +531,8 @@ def _solve_each(triangle: FloatArray, right: FloatArray) -> FloatArray:
     is_zero = np.abs(diagonal) <= np.finfo(np.float64).tiny
     if is_zero.any():
         triangle = triangle.copy()
-        np.einsum("kii->ki", triangle)[is_zero] = 1e-300
+        writable_diagonal = np.einsum("kii->ki", triangle)  # a view of the copy
+        writable_diagonal[is_zero] = 1e-300
     shape = (len(triangle), *right.shape[-2:])
     solution = np.linalg.solve(triangle, np.broadcast_to(right, shape))
     return np.asarray(solution)
@@ -509,6 +553,7 @@ def _closed_near(robot: Robot, start: FloatArray, size_m: float) -> FloatArray:
             if position is not None:
                 return position
     closure, gaps = _worst_closure(robot, np.abs(residual))
+    # A gap is a share of the robot's size where its direction is a length, else an angle.
     values = ", ".join(map(_gap, closure.directions, gaps * size_m, gaps))
     raise ModelError(
         f"closure {closure.name!r} cannot close at the assembly pose: {values} apart where it is "
@@ -563,6 +608,9 @@ def _gap(direction: str, length_m: float, angle_rad: float) -> str:
 def _independent(free: FloatArray) -> tuple[int, ...]:
     """Joints that move most independently of each other, by pivoted QR of the free motions,
     shape (n, d).
+
+    Each is the joint that moves most in the motions that are left when those of the joints before
+    it are projected out (Gram-Schmidt).
     """
     remaining = free.copy()
     chosen: list[int] = []
@@ -584,12 +632,15 @@ def null_space(jacobian: FloatArray) -> FloatArray:
 
 
 def _generic_rank(robot: Robot, position: FloatArray, free: FloatArray, size_m: float) -> int:
-    """Degrees of freedom that the motors move a little away from the assembly pose."""
+    """Degrees of freedom that the motors move a little away from the assembly pose.
+
+    The rank is the largest of four poses at random: at a single one it may be singular again.
+    """
     motors = list(robot.axis_joints)
-    draw = np.random.default_rng(0)
+    rng = np.random.default_rng(0)
     best = 0
     for _ in range(4):
-        near = position + 0.02 * free @ draw.standard_normal(free.shape[1])
+        near = position + 0.02 * free @ rng.standard_normal(free.shape[1])
         for _ in range(MAX_ITERATIONS):
             closing = loops(robot, near[None], size_m)
             near -= _shortest_step(closing.jacobian[0], closing.residual[0])
@@ -656,7 +707,7 @@ def _size(robot: Robot, position: FloatArray) -> float:
 
 
 def _least_squares(matrix: FloatArray, right: FloatArray) -> FloatArray:
-    """Solution of A x = b, shapes (k, m, d) and (k, m); for square A exact."""
+    """Solution of A x = b in each sample, shapes (k, m, d) and (k, m); exact for a square A."""
     q, r = np.linalg.qr(matrix)
     projected = np.einsum("kmd,km->kd", q, right)  # Qᵀ b
     solution = np.linalg.solve(r, projected[..., None])

@@ -10,7 +10,14 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ident.arrays import FloatArray, as_array, require_entries, require_kind, require_number
+from ident.arrays import (
+    FloatArray,
+    as_array,
+    is_whole_number,
+    require_entries,
+    require_kind,
+    require_number,
+)
 from ident.errors import ModelError
 
 
@@ -293,8 +300,7 @@ def _require_place(label: str, place: Place, count: int) -> None:
 
 def _require_index(label: str, index: object, end: int, *, least: int = 0) -> None:
     """Refuse what is no index of a joint from `least` to below `end`, as a `ModelError`."""
-    is_whole = isinstance(index, (int, np.integer)) and not isinstance(index, bool)
-    if not is_whole or not least <= index < end:  # type: ignore[operator]
+    if not is_whole_number(index) or not least <= index < end:  # type: ignore[operator]
         raise ModelError(
             f"{label} is {index!r:.60}; expected a whole number from {least} to {end - 1}; "
             "give the index of a joint"

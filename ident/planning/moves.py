@@ -37,17 +37,22 @@ from ident.planning.limits import JointLimits, followers_beyond
 DWELL_S = 0.1  #: Rest at each target [s]: moves are told apart by it
 #: Least speed of a random move, as a share of the fastest that its limits allow
 SLOWEST_SHARE = 0.3
-#: Least way of a random move, as a share of that to a target anywhere: short moves are more moves
+#: Least way of a random move, as a share of the way to a target drawn from all positions: shorter
+#: ways leave time for more moves
 SHORTEST_SHARE = 0.3
-SHARPNESS = 8.0  #: Order of the norm of all deviations that a plan lowers, nearly the largest
+#: p of the p-norm of all predicted σ, which a plan lowers: nearly the largest σ
+COST_NORM = 8.0
 NEAR_SHARE = 0.15  #: Standard deviation of the step to a near target, as a share of the range
 FEWEST_MOVES = 10  #: σ of a fit is found by leaving out moves
 MAX_TRIES = 100  #: Random moves from one place before its limits count as too narrow
-RUNS: tuple[int | None, ...] = (None, 0)  #: The moves are made without load, and with the payload
+#: Index of the payload in each run of the same moves: once without load, once with the payload
+RUNS: tuple[int | None, ...] = (None, 0)
 MOST_SAMPLES = 1e7  #: Of a motion: more would take gigabytes
 LONGEST_RUN_S = 3600.0  #: Of a plan: a longer one would hold gigabytes, and an arm is warm by then
-PEAK_SPEED = 15.0 / 8.0  #: Largest speed of a move with least jerk, over its mean speed
-PEAK_ACCELERATION = 10.0 / 3.0**0.5  #: Its largest acceleration, over way / duration²
+#: Largest speed of a move with least jerk, at its middle, relative to the mean speed d/T
+PEAK_SPEED = 15.0 / 8.0
+#: Its largest acceleration, at s = 1/2 − √3/6, relative to d/T²
+PEAK_ACCELERATION = 10.0 / 3.0**0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,8 +104,8 @@ class PlannedMoves:
                 f"move_s has {move_s.min():g} s; expected durations above 0 s; take "
                 "those of plan_moves"
             )
-        duration_s = float(move_s.sum() + dwell_s * len(move_s))
-        samples = rate_hz * duration_s
+        all_s = float(move_s.sum() + dwell_s * len(move_s))
+        samples = rate_hz * all_s
         if samples > MOST_SAMPLES:
             expected = f"at most {MOST_SAMPLES:.0e}; give a lower `rate_hz`, or fewer moves"
             raise ModelError(f"found {samples:.3g} samples at {rate_hz:g} Hz; expected {expected}")
@@ -109,20 +114,27 @@ class PlannedMoves:
         begin_s = np.concatenate(([0.0], ends_s[:-1]))
         move = np.searchsorted(begin_s, time_s, side="right") - 1
         way_rad = np.diff(self.target_rad, axis=0)
-        own_s = self.move_s[move]
+        move_of_sample_s = self.move_s[move]
         since_begin_s = time_s - begin_s[move]
-        share = np.minimum(since_begin_s / own_s, 1.0)
-        return time_s, _least_jerk(self.target_rad[move], way_rad[move], own_s, share)
+        progress = np.minimum(since_begin_s / move_of_sample_s, 1.0)  # one while the arm dwells
+        motion = _least_jerk(self.target_rad[move], way_rad[move], move_of_sample_s, progress)
+        return time_s, motion
 
 
 def _least_jerk(
-    start_rad: FloatArray, way_rad: FloatArray, move_s: FloatArray, share: FloatArray
+    start_rad: FloatArray, way_rad: FloatArray, move_s: FloatArray, progress: FloatArray
 ) -> Motion:
-    """q = q₀ + d (10 s³ − 15 s⁴ + 6 s⁵), s = t/T: Flash & Hogan, J.
+    """Motion of least jerk from rest to rest: q = q₀ + d (10 s³ − 15 s⁴ + 6 s⁵) with s = t/T.
 
-    Neurosci. 5 (1985); shapes (k, n) and (k,).
+    Flash & Hogan, Journal of Neuroscience 5 (1985).
+
+    Args:
+        start_rad: q₀ of the move of each sample, shape (k, n).
+        way_rad: d of it, shape (k, n).
+        move_s: T of it [s], shape (k,).
+        progress: s, 0 to 1, shape (k,).
     """
-    s = share[:, None]
+    s = progress[:, None]
     duration_s = move_s[:, None]
     position = 10.0 * s**3 - 15.0 * s**4 + 6.0 * s**5
     speed = 30.0 * s**2 - 60.0 * s**3 + 30.0 * s**4
@@ -135,21 +147,21 @@ def _least_jerk(
 
 
 class _Exchange(Enum):
-    """What is changed in a try."""
+    """What a try changes; numbered as the random draw is."""
 
-    ANYWHERE = 0
-    NEAR = 1
-    SPEED = 2
+    ANYWHERE = 0  #: a target, to one drawn from all positions
+    NEAR = 1  #: a target, by a small step
+    SPEED = 2  #: the speed of a move
 
 
 @dataclass(frozen=True, slots=True)
 class _Draft:
-    """Targets and durations of moves while they are exchanged, with what each of them tells."""
+    """Moves while they are exchanged, with the information of each."""
 
-    target_rad: tuple[FloatArray, ...]  #: start, then the target of each move
-    share: tuple[float, ...]  #: of the fastest speed, of each move
-    move_s: tuple[float, ...]  #: duration of each move
-    information: tuple[FloatArray, ...]  #: of each move, shape (p, p)
+    target_rad: tuple[FloatArray, ...]  #: start, then the target of each move, shapes (n,)
+    speed_share: tuple[float, ...]  #: speed of each move, as a share of the fastest possible
+    move_s: tuple[float, ...]  #: duration of each move [s]
+    information: tuple[FloatArray, ...]  #: Fisher information of each move, shape (p, p)
 
     @property
     def duration_s(self) -> float:
@@ -165,7 +177,7 @@ class _Search:
     limits: JointLimits
     effort: FloatArray  #: limit of each axis [Nm or N], inf where it is not known, shape (n,)
     row_s: float  #: time between two rows of the fit [s]
-    edge_s: float  #: how long after a rest rows begin to count [s]
+    edge_s: float  #: time next to a rest in which rows are not used [s]
 
     def fastest_s(self, start_rad: FloatArray, end_rad: FloatArray) -> float:
         """Shortest duration of a move within the limits of velocity and acceleration [s]."""
@@ -177,8 +189,8 @@ class _Search:
     def information(
         self, start_rad: FloatArray, end_rad: FloatArray, move_s: float
     ) -> FloatArray | None:
-        """Information of a move, without load and with the payload;
-        None where a drive would not have the torque.
+        """Fisher information of a move made without load and with the payload, shape (p, p);
+        None where it has no row, or needs more torque than a drive has.
         """
         time_s = np.arange(0.5 * self.row_s, move_s, self.row_s)
         rows = len(time_s)
@@ -189,7 +201,7 @@ class _Search:
             start_rad=np.tile(start_rad, (rows, 1)),
             way_rad=np.tile(way_rad, (rows, 1)),
             move_s=np.full(rows, move_s),
-            share=time_s / move_s,
+            progress=time_s / move_s,
         )
         expected = self.design.expectation
         if np.isfinite(self.effort).any():
@@ -200,18 +212,20 @@ class _Search:
         is_after_rest = time_s > self.edge_s
         is_before_rest = time_s < move_s - self.edge_s
         is_moving = is_after_rest & is_before_rest
+        # A motor's row is used where all joints move that it turns, or whose torque it supplies.
         joint_moves = np.abs(way_rad) > 0.0
         train = expected.model.drive_train
-        needed = (train.to_motor != 0.0) | (train.direction != 0.0)
-        motor_moves = np.array([joint_moves[joints].all() for joints in needed])
+        is_coupled = (train.to_motor != 0.0) | (train.direction != 0.0)
+        motor_moves = np.array([joint_moves[joints].all() for joints in is_coupled])
         use = motor_moves[:, None] & is_moving
         return self.design.information(Excitation(motion, use), RUNS)
 
     def random_target(
         self, rng: np.random.Generator, start_rad: FloatArray | None = None
     ) -> FloatArray:
-        """A target within the limits, with a margin, on the way from the start to anywhere; None:
-        anywhere.
+        """A target within the limits, with a margin, shape (n,).
+
+        It is drawn from all positions; with a start, it lies on the way there.
         """
         lower, upper = self.limits.targets()
         end_rad = rng.uniform(lower, upper)
@@ -227,11 +241,11 @@ class _Search:
         return np.clip(target_rad + step_rad, lower, upper)
 
     def cost(self, information: FloatArray) -> float:
-        """Nearly the largest predicted deviation [%]; inf where a gain does not show."""
+        """Nearly the largest predicted σ of a gain [%]; inf where a gain does not show."""
         std_percent = self.design.std_percent(information)
         if not np.isfinite(std_percent).all():
             return np.inf
-        return float(np.linalg.norm(std_percent, SHARPNESS))
+        return float(np.linalg.norm(std_percent, COST_NORM))
 
 
 @takes()
@@ -389,10 +403,10 @@ def _fast_motion(limits: JointLimits) -> Motion:
 
 
 def _move(
-    search: _Search, start_rad: FloatArray, end_rad: FloatArray, share: float
+    search: _Search, start_rad: FloatArray, end_rad: FloatArray, speed_share: float
 ) -> tuple[float, FloatArray] | None:
     """Duration and information of a move; None where it cannot be made."""
-    move_s = search.fastest_s(start_rad, end_rad) / share
+    move_s = search.fastest_s(start_rad, end_rad) / speed_share
     information = search.information(start_rad, end_rad, move_s)
     if information is None:
         return None
@@ -404,8 +418,8 @@ def _random_moves(search: _Search, rng: np.random.Generator, duration_s: float) 
     targets = [search.random_target(rng)]
     shares: list[float] = []
     moves_s: list[float] = []
-    found: list[FloatArray] = []
-    tries = 0
+    information: list[FloatArray] = []
+    tries = 0  # since the last move that could be made
     while tries < MAX_TRIES:
         tries += 1
         start = targets[-1]
@@ -418,14 +432,14 @@ def _random_moves(search: _Search, rng: np.random.Generator, duration_s: float) 
         move = _move(search, start, target, share)
         if move is None:
             continue
-        move_s, information = move
+        move_s, own_information = move
         dwells_s = DWELL_S * (len(moves_s) + 1)
         if sum(moves_s) + move_s + dwells_s > duration_s:
             break
         targets.append(target)
         shares.append(share)
         moves_s.append(move_s)
-        found.append(information)
+        information.append(own_information)
         tries = 0
     if len(moves_s) < FEWEST_MOVES:
         raise PlanUnfit(
@@ -433,7 +447,7 @@ def _random_moves(search: _Search, rng: np.random.Generator, duration_s: float) 
             expected=f"at least {FEWEST_MOVES}, and better 30",
             remedy="give a longer `duration_s`, higher `limits`, or the right efforts in the URDF",
         )
-    return _Draft(tuple(targets), tuple(shares), tuple(moves_s), tuple(found))
+    return _Draft(tuple(targets), tuple(shares), tuple(moves_s), tuple(information))
 
 
 def _improved(
@@ -462,26 +476,27 @@ def _exchanged(
     changed = int(rng.integers(len(draft.target_rad)))
     kind = _Exchange(int(rng.integers(len(_Exchange))))
     targets = list(draft.target_rad)
-    shares = list(draft.share)
+    shares = list(draft.speed_share)
     moves_s = list(draft.move_s)
     information = list(draft.information)
+    # The moves to this target and from it; the start has none to it, the last target none from it.
     touched = [move for move in (changed - 1, changed) if 0 <= move < len(moves_s)]
     if kind is _Exchange.ANYWHERE:
-        before = None
+        start = None
         if changed:
-            before = targets[changed - 1]
-        targets[changed] = search.random_target(rng, before)
+            start = targets[changed - 1]
+        targets[changed] = search.random_target(rng, start)
     elif kind is _Exchange.NEAR:
         targets[changed] = search.near_target(rng, targets[changed])
     else:
         shares[touched[0]] = float(rng.uniform(SLOWEST_SHARE, 1.0))
     for move in touched:
-        start = targets[move]
-        end = targets[move + 1]
+        start_rad = targets[move]
+        end_rad = targets[move + 1]
         share = shares[move]
-        if search.fastest_s(start, end) / share > duration_s:
+        if search.fastest_s(start_rad, end_rad) / share > duration_s:
             return None
-        found = _move(search, start, end, share)
+        found = _move(search, start_rad, end_rad, share)
         if found is None:
             return None
         moves_s[move], information[move] = found
