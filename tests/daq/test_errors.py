@@ -114,5 +114,5 @@ def test_a_missing_folder_of_an_output_is_named(tmp_path: Path) -> None:
     with pytest.raises(OutputFailed, match=r"no folder .*none; .*mkdir -p"), writing(path):
         path.write_text("")
     (tmp_path / "none").write_text("a file")
-    with pytest.raises(OutputFailed, match="no folder"), writing(path):
+    with pytest.raises(OutputFailed, match=r"found .*none is a file"), writing(path):
         path.write_text("")
