@@ -174,6 +174,7 @@ def test_a_correction_without_the_payload_of_the_log_is_refused(
         ('<joint name="J2"', '<joint name="elbow"'),
         ('type="revolute"', 'type="prismatic"'),
     ],
+    ids=["name", "kind"],
 )
 def test_a_robot_with_other_joints_is_another_one(old: str, new: str, demo: Cell) -> None:
     assert old in demo.urdf

@@ -5,7 +5,7 @@ and `daq.fit_logs`.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
@@ -35,6 +35,7 @@ from daq.workflow.diagnoses import geometry_beside, geometry_refusal, hidden_zer
 from daq.workflow.fit import calibration_of, close_loop, description_diagnoses, fit, fit_logs
 from daq.workflow.validate import cross_validate, replaced_geometry
 from daq.writeback.gates.fit import uncorrected_description
+from ident.calibration import Calibration
 from ident.data.run import Recording, Run
 from ident.discovery.effect_verdict import Judgement
 from ident.discovery.geometry_check import AlikeCorrections, GeometryCheck
@@ -49,7 +50,7 @@ from ident.model.model import DriveTrain
 from tests.ident.arms import THREE_AXES
 from tests.ident.findings import passed_finding
 from tests.ident.mistaken import small_recordings, turned, with_currents
-from tests.ident.recordings import MOUNTED, record, three_axes_truth
+from tests.ident.recordings import MOUNTED, FloatArray, record, three_axes_truth
 from tests.remembered import remembered
 
 pytestmark = pytest.mark.slow
@@ -73,8 +74,11 @@ conditioning:
   {position_cutoff_hz: 40.0, position_order: 4, decimation_cutoff_hz: 20.0, standstill_rad_s: [0.03, 0.03, 0.03]}
 """  # noqa: E501
 
-SECTION = "axes.zero_offset (J2)"  #: That a given description changes
-RUNS, USED = 8, 6  #: Recordings, and how many of them a fit uses; the others are held out
+CHANGED_SECTION = "axes.zero_offset (J2)"  #: of a description that is given
+RUNS = 8  #: recordings r0 to r7
+USED = 6  #: how many of them a fit uses; the others are held out
+LOGS = [Path(f"r{number}") for number in range(USED)]
+HELD_OUT = [Path(f"r{number}") for number in range(USED, RUNS)]
 SECONDS = 13.0
 FEW = {"stribeck", "load-friction", "spring", "lag", "time-skew"}
 FEW_FAMILIES = tuple(family for family in EFFECTS if family[0].name in FEW)
@@ -87,14 +91,38 @@ Mistake = Callable[[Runs], Runs]
 
 def in_one(number: int, change: Callable[[Run], Run]) -> Mistake:
     """A mistake in one of the runs."""
-    return lambda runs: [change(run) if index == number else run for index, run in enumerate(runs)]
+
+    def mistake(runs: Runs) -> Runs:
+        changed = list(runs)
+        changed[number] = change(runs[number])
+        return changed
+
+    return mistake
+
+
+def in_all(change: Callable[[Run], Run]) -> Mistake:
+    """A mistake in every run."""
+    return lambda runs: [change(run) for run in runs]
+
+
+def in_used(change: Callable[[Run], Run]) -> Mistake:
+    """A mistake in every run that a fit uses."""
+    return lambda runs: [*map(change, runs[:USED]), *runs[USED:]]
+
+
+def in_loaded(change: Callable[[Run], Run]) -> Mistake:
+    """A mistake in every run with a payload."""
+
+    def change_loaded(run: Run) -> Run:
+        return change(run) if run.payload else run
+
+    return in_all(change_loaded)
 
 
 def carrying(body: np.ndarray) -> Mistake:
     """Another body than the payload in the second loaded run."""
-    truth = three_axes_truth()
-    carried = small_recordings(truth, 0, count=RUNS, seconds=SECONDS, bodies={3: body})[3]
-    return in_one(3, lambda _: carried)
+    runs = small_recordings(three_axes_truth(), 0, count=RUNS, seconds=SECONDS, bodies={3: body})
+    return in_one(3, lambda _: runs[3])
 
 
 def scaled(*factors: float) -> Mistake:
@@ -110,7 +138,7 @@ def of_size(*axes: int) -> Mistake:
         current[:, axes] = np.abs(current[:, axes])
         return replace(run, current_a=current)
 
-    return lambda runs: [change(run) for run in runs]
+    return in_all(change)
 
 
 def noisy(run: Run) -> Run:
@@ -137,14 +165,13 @@ def late_currents(*delays_s: float) -> Mistake:
     """Currents that were stamped too late, by so much on each axis."""
 
     def change(run: Run) -> Run:
-        columns = zip(run.current_a.T, delays_s, strict=True)
         late = [
-            np.interp(run.time_s - delay_s, run.time_s, current) for current, delay_s in columns
+            np.interp(run.time_s - delay_s, run.time_s, current)
+            for current, delay_s in zip(run.current_a.T, delays_s, strict=True)
         ]
-        current_a = np.stack(late, axis=1)
-        return replace(run, current_a=current_a)
+        return replace(run, current_a=np.stack(late, axis=1))
 
-    return lambda runs: [change(run) for run in runs]
+    return in_all(change)
 
 
 def without_zero(run: Run) -> Run:
@@ -155,10 +182,9 @@ def without_zero(run: Run) -> Run:
 def mounted_on_a_wall(runs: Runs) -> Runs:
     """Recordings of an arm whose base is turned from what the cell says."""
     truth = three_axes_truth()
-    gravity_m_s2 = np.array([0.0, -9.81, 0.0])
-    model = with_gravity(truth.model, gravity_m_s2)
-    wall = replace(truth, model=model)
-    return small_recordings(wall, 0, count=len(runs), seconds=SECONDS)
+    model = with_gravity(truth.model, np.array([0.0, -9.81, 0.0]))
+    on_wall = replace(truth, model=model)
+    return small_recordings(on_wall, 0, count=len(runs), seconds=SECONDS)
 
 
 def exchanged(run: Run) -> Run:
@@ -175,9 +201,8 @@ def forgotten(run: Run) -> Run:
 def clipped(run: Run) -> Run:
     """A run in which a limit clips the current of J2, and the drive does not report it."""
     current = run.current_a.copy()
-    absolute_current = np.abs(current[:, 1])
-    limit = float(np.percentile(absolute_current, 90.0))
-    current[:, 1] = np.clip(current[:, 1], -limit, limit)
+    limit_a = np.percentile(np.abs(current[:, 1]), 90.0)
+    current[:, 1] = np.clip(current[:, 1], -limit_a, limit_a)
     return replace(run, current_a=current)
 
 
@@ -191,10 +216,9 @@ def glitched(run: Run) -> Run:
 def frozen(run: Run) -> Run:
     """A run in which the position of J2 stands still for a while although the joint moves."""
     position = run.position_rad.copy()
-    position_steps = np.diff(position[:, 1])
-    speed = np.abs(position_steps)
-    largest_speed_index = np.argmax(speed[1000:-1000])
-    start = 1000 + int(largest_speed_index)
+    speed = np.abs(np.diff(position[:, 1]))
+    margin = 1000  # samples, far from both ends
+    start = margin + int(np.argmax(speed[margin:-margin]))
     position[start : start + 200, 1] = position[start, 1]
     return replace(run, position_rad=position)
 
@@ -208,8 +232,15 @@ def displaced(run: Run) -> Run:
 
 def constant(run: Run) -> Run:
     """A run in which the channel of J2 has one value."""
-    current_a = run.current_a * np.array([1.0, 0.0, 1.0]) + np.array([0.0, 0.5, 0.0])
+    current_a = run.current_a.copy()
+    current_a[:, 1] = 0.5
     return replace(run, current_a=current_a)
+
+
+def half_as_large(run: Run) -> Run:
+    """A run in which the current of J2 is half as large."""
+    (scaled_run,) = with_currents([run], np.array([1.0, 0.51, 1.0]))
+    return scaled_run
 
 
 def still(run: Run) -> Run:
@@ -229,34 +260,30 @@ MISTAKES: dict[str, tuple[Mistake, str]] = {
     "mA": (scaled(1000.0, 1000.0, 1000.0), "UnitsMistaken"),
     "sizes": (of_size(0, 1, 2), "CurrentUnsigned"),
     "size of J3": (of_size(2), "CurrentUnsigned"),
-    "J2 and J3 exchanged": (lambda runs: [exchanged(run) for run in runs], "ChannelsExchanged"),
-    "position of J2 "
-    "reversed": (lambda runs: [reversed_position(run) for run in runs], "position-reversed J2"),
+    "J2 and J3 exchanged": (in_all(exchanged), "ChannelsExchanged"),
+    "position of J2 reversed": (in_all(reversed_position), "position-reversed J2"),
     "mounted on a wall": (mounted_on_a_wall, "GeometryTurned"),
-    "zero of J2 off": (lambda runs: [offset(run) for run in runs], "zero-off J2"),
+    "zero of J2 off": (in_all(offset), "zero-off J2"),
     "all currents late": (late_currents(0.004, 0.004, 0.004), "time-skew"),
     "current of J1 late": (late_currents(0.01, 0.0, 0.0), "current-late J1"),
     "payload turned": (carrying(turned(np.pi)), "payload-differs r3"),
     "payload left off": (carrying(np.zeros(10)), "PayloadUnseen"),
-    "noise on J3": (lambda runs: [*map(noisy, runs[:USED]), *runs[USED:]], "axis-error J3"),
+    "noise on J3": (in_used(noisy), "axis-error J3"),
     "J2 clipped": (in_one(3, clipped), "current-clipped r3 J2"),
     "J2 wrong in a sample": (in_one(3, glitched), "readings-damaged r3 J2"),
     "J2 displaced": (in_one(3, displaced), "ReadingsDamaged"),
     "J2 constant": (in_one(3, constant), "CurrentConstant"),
-    "J3 still": (lambda runs: [still(run) if run.payload else run for run in runs], "JointStill"),
+    "J3 still": (in_loaded(still), "JointStill"),
     "held out: J2 clipped": (in_one(7, clipped), "current-clipped r7 J2"),
     "held out: J2 frozen": (in_one(7, frozen), "readings-frozen r7 J2"),
     "held out: J2 constant": (in_one(7, constant), "CurrentConstant"),
-    "held out: J2 half as large": (
-        in_one(7, lambda run: with_currents([run], np.array([1.0, 0.51, 1.0]))[0]),
-        "current-off-scale r7 J2",
-    ),
+    "held out: J2 half as large": (in_one(7, half_as_large), "current-off-scale r7 J2"),
     "held out: exchanged": (in_one(6, exchanged), "channels-exchanged r6 J2 J3"),
     "held out: position of J2 reversed": (in_one(6, reversed_position), "position-reversed r6 J2"),
     "held out: zero of J2 lost": (in_one(6, without_zero), "zero-off r6 J2"),
     "held out: noise on J3": (in_one(6, noisy), "axis-error r6 J3"),
     "held out: without payload": (in_one(7, forgotten), "payload-differs r7"),
-}  # fmt: skip
+}
 
 
 @pytest.fixture(scope="module")
@@ -264,11 +291,12 @@ def three_axis_cell(tmp_path_factory: pytest.TempPathFactory) -> Cell:
     folder = tmp_path_factory.mktemp("cell")
     (folder / "arm.urdf").write_text(THREE_AXES.urdf)
     gains = three_axes_truth().gains
-    axes = "".join(
-        AXIS.format(name=f"J{number}", gain=gain) for number, gain in enumerate(gains, start=1)
-    )
-    (folder / "cell.yaml").write_text(CELL + axes + REST)
-    return load_cell(folder / "cell.yaml")
+    text = CELL
+    for number, gain in enumerate(gains, start=1):
+        text += AXIS.format(name=f"J{number}", gain=gain)
+    cell_file = folder / "cell.yaml"
+    cell_file.write_text(text + REST)
+    return load_cell(cell_file)
 
 
 @pytest.fixture(scope="module")
@@ -281,13 +309,55 @@ def said(diagnoses: tuple[Diagnosis, ...]) -> set[str]:
     return {" ".join((one.name, *one.runs, *one.axes)) for one in diagnoses}
 
 
-def refuse_to_weigh() -> None:
+def texts(diagnoses: tuple[Diagnosis, ...]) -> list[str]:
+    return sorted(one.text for one in diagnoses)
+
+
+def refuse_to_weigh(*_: object, **__: object) -> None:
     """Weigh no payload."""
     raise IdentificationError("no mass is asked for")
 
 
-def texts(diagnoses: tuple[Diagnosis, ...]) -> list[str]:
-    return sorted(one.text for one in diagnoses)
+def with_digest(run: Run) -> Run:
+    """The run, with its number for the digest of its log."""
+    number = int(run.name[1:])
+    return replace(run, digest=f"{number:064x}")
+
+
+def serve(monkeypatch: pytest.MonkeyPatch, cell: Cell, runs: Iterable[Run]) -> None:
+    """Give these runs to every verb in place of logs of their names."""
+    by_name = {run.name: run for run in runs}
+
+    def load(
+        path: Path, given: Cell | None = None, _lossy: LossyLogs = LossyLogs.REFUSED
+    ) -> tuple[Run, Cell]:
+        return by_name[path.name], given or cell
+
+    monkeypatch.setattr(fit_module, "load_run", load)
+    monkeypatch.setattr(validate_module, "load_run", load)
+
+
+def search_few_families(monkeypatch: pytest.MonkeyPatch) -> None:
+    few = partial(find_effects, families=FEW_FAMILIES)
+    monkeypatch.setattr(fit_module, "find_effects", few)
+
+
+def remember_geometry(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Compute no check of the geometry again that was asked for with the same arguments.
+
+    Every verb asks for these checks itself.
+    """
+    turned_geometry = remembered(find_turned_geometry)
+    monkeypatch.setattr(diagnoses_module, "find_turned_geometry", turned_geometry)
+    monkeypatch.setattr(validate_module, "find_turned_geometry", turned_geometry)
+    monkeypatch.setattr(fit_module, "geometry_beside", remembered(geometry_beside))
+
+
+def certificate_text(calibration: Calibration) -> str:
+    """What the certificate shows, without its markup."""
+    comparison = without_controller(calibration, "Not read.", WHEN)
+    page = certificate_page(certify(calibration, comparison))
+    return unescape(re.sub(r"<[^>]*>|`", "", page))
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)
@@ -295,57 +365,39 @@ def test_the_same_is_said_by_every_verb(
     three_axis_cell: Cell, recorded: Runs, monkeypatch: pytest.MonkeyPatch, mistake: str
 ) -> None:
     change, expected = MISTAKES[mistake]
-    runs = {run.name: replace(run, digest=f"{int(run.name[1:]):064x}") for run in change(recorded)}
-
-    def load(
-        path: Path, given: Cell | None = None, _lossy: LossyLogs = LossyLogs.REFUSED
-    ) -> tuple[Run, Cell]:
-        return runs[path.name], given or three_axis_cell
-
-    for module in (fit_module, validate_module):
-        monkeypatch.setattr(module, "load_run", load)
-    monkeypatch.setattr(fit_module, "find_effects", partial(find_effects, families=FEW_FAMILIES))
-    # Every verb asks for these itself; what is asked with the same arguments again is not computed
-    # again.
-    turned_geometry = remembered(find_turned_geometry)
-    for asking in (diagnoses_module, validate_module):
-        monkeypatch.setattr(asking, "find_turned_geometry", turned_geometry)
-    monkeypatch.setattr(fit_module, "geometry_beside", remembered(geometry_beside))
+    serve(monkeypatch, three_axis_cell, map(with_digest, change(recorded)))
+    search_few_families(monkeypatch)
+    remember_geometry(monkeypatch)
     # The masses of a validation say nothing of a diagnosis.
-    monkeypatch.setattr(validate_module, "rows_to_weigh", lambda *_, **__: refuse_to_weigh())
-    paths = [Path(f"r{number}") for number in range(RUNS)]
-    logs = paths[:USED]
-    holdout = paths[USED:]
-    verbs: dict[str, Callable[[], tuple[Diagnosis, ...]]] = {
-        # Where a search adds an effect, the gains are others, and so are the numbers in a text.
-        "residual": lambda: close_loop(unjudged, 0).diagnoses,
-        "fit_logs": lambda: fit_logs(logs, holdout=holdout, effects=False, created=WHEN).diagnoses,
-    }
+    monkeypatch.setattr(validate_module, "rows_to_weigh", refuse_to_weigh)
+
+    def diagnoses_of_fit_logs() -> tuple[Diagnosis, ...]:
+        return fit_logs(LOGS, holdout=HELD_OUT, effects=False, created=WHEN).diagnoses
+
     try:
-        fitted = fit(logs, holdout=holdout, keep_rows=True)
+        fitted = fit(LOGS, holdout=HELD_OUT, keep_rows=True)
         # As the command does it: the search judges held-out logs, with its own model.
         unjudged = fitted
         if mistake.startswith("held out"):
-            unjudged = fit(logs, holdout=holdout, keep_rows=True, judge_holdout=False)
+            unjudged = fit(LOGS, holdout=HELD_OUT, keep_rows=True, judge_holdout=False)
     except IdentificationError as error:
         assert type(error).__name__ == expected
         with pytest.raises(type(error), match=re.escape(str(error))):
-            verbs["fit_logs"]()
+            diagnoses_of_fit_logs()
         return
     assert said(fitted.diagnoses) == ({expected} if expected else set())
-    diagnoses = verbs["fit_logs"]()
-    assert texts(diagnoses) == texts(fitted.diagnoses)
-    assert said(verbs["residual"]()) == said(fitted.diagnoses)
+    expected_texts = texts(fitted.diagnoses)
+    assert texts(diagnoses_of_fit_logs()) == expected_texts
+    # Where a search adds an effect, the gains are others, and so are the numbers in a text.
+    closed = close_loop(unjudged, 0)
+    assert said(closed.diagnoses) == said(fitted.diagnoses)
     content = encode_calibration(calibration_of(fitted, WHEN))
     calibration = decode_calibration(content, "calibration.yaml")
-    assert texts(calibration.diagnoses) == texts(fitted.diagnoses)
-    for given in (logs, holdout, [*logs, *holdout]):
-        assert texts(cross_validate({"one": calibration}, given).diagnoses) == texts(
-            fitted.diagnoses
-        )
-    comparison = without_controller(calibration, "Not read.", WHEN)
-    page = certificate_page(certify(calibration, comparison))
-    shown = unescape(re.sub(r"<[^>]*>|`", "", page))
+    assert texts(calibration.diagnoses) == expected_texts
+    for logs in (LOGS, HELD_OUT, [*LOGS, *HELD_OUT]):
+        validated = cross_validate({"one": calibration}, logs)
+        assert texts(validated.diagnoses) == expected_texts
+    shown = certificate_text(calibration)
     for one in fitted.diagnoses:
         assert f"CHECK {one.text}.".replace("`", "") in shown
 
@@ -361,106 +413,102 @@ def test_a_wrong_description_is_corrected_before_the_next_step(
     degrees: float,
     next_step: str,
 ) -> None:
-    runs = {
-        run.name: replace(offset(run, degrees), digest=f"{int(run.name[1:]):064x}")
-        for run in recorded
-    }
-    for module in (fit_module, validate_module):
-        monkeypatch.setattr(module, "load_run", lambda path, *_: (runs[path.name], three_axis_cell))
-    paths = [Path(f"r{number}") for number in range(RUNS)]
-    fitted = fit(paths[:USED], holdout=paths[USED:])
+    runs = [with_digest(offset(run, degrees)) for run in recorded]
+    serve(monkeypatch, three_axis_cell, runs)
+    fitted = fit(LOGS, holdout=HELD_OUT)
     calibration = calibration_of(fitted, WHEN)
-    say_after_fit(calibration, paths[:USED], Path("fit.yaml"))
+    say_after_fit(calibration, LOGS, Path("fit.yaml"))
+    is_wrong = degrees != 0.0
     error_output = capsys.readouterr().err
     assert f"Next: {next_step}" in error_output
-    assert bool(uncorrected_description(calibration)) == bool(degrees)
+    assert bool(uncorrected_description(calibration)) == is_wrong
+    validated = cross_validate({"one": calibration}, HELD_OUT)
     screen = StringIO()
     console = Console(width=400, file=screen)
-    console.print(*validation_view(calibration, cross_validate({"one": calibration}, paths[USED:])))
+    console.print(*validation_view(calibration, validated))
     said_of_fit = "The fit of this calibration found: CHECK J2" in screen.getvalue()
-    assert said_of_fit == bool(degrees)
+    assert said_of_fit == is_wrong
 
 
 def test_a_zero_that_a_given_description_changes_is_tested_on_a_run_without_load(
     three_axis_cell: Cell, recorded: Runs, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It explains a small part of what a run without load leaves, and was not named."""
-    runs = {run.name: replace(run, digest=f"{int(run.name[1:]):064x}") for run in recorded}
-    monkeypatch.setattr(fit_module, "load_run", lambda path, *_: (runs[path.name], three_axis_cell))
-    logs = [Path(f"r{number}") for number in range(USED)]
-    calibration = calibration_of(fit(logs), WHEN)
+    serve(monkeypatch, three_axis_cell, map(with_digest, recorded))
+    calibration = calibration_of(fit(LOGS), WHEN)
     given = Recording(
-        None, None, (), (), 0, (), None, replaced_configuration_sha256="a", corrected=(SECTION,)
+        recorded_s=None,
+        entered_kg=None,
+        serials=(),
+        saturated_percent=(),
+        lost_cycles=0,
+        missing=(),
+        controller_sha256=None,
+        replaced_configuration_sha256="a",
+        corrected=(CHANGED_SECTION,),
     )
     rng = np.random.default_rng(1)
-    current_a = recorded[6].current_a
-    noise_a = 0.06 * rng.standard_normal(current_a.shape)
-    moved = replace(
-        offset(recorded[6], 4.0), current_a=recorded[6].current_a + noise_a, recording=given
-    )
-    other = replace(three_axis_cell, digest="other", recording_digest="other")
-    found: dict[str, set[str]] = {}
-    changed_moved = replace(moved, recording=None)
-    for name, run in {"given": moved, "recorded": changed_moved}.items():
-        monkeypatch.setattr(validate_module, "load_run", lambda *_, run=run: (run, other))
-        diagnoses = cross_validate({"one": calibration}, [Path("r6")], other).diagnoses
-        found[name] = said(diagnoses)
-        if name == "given":
-            assert "the given cell file has another number here" in diagnoses[0].remedy
-    expected = {"given": {"zero-off r6 J2"}, "recorded": set()}
-    assert found == expected
+    unloaded = recorded[6]
+    noise_a = 0.06 * rng.standard_normal(unloaded.current_a.shape)
+    moved = replace(offset(unloaded, 4.0), current_a=unloaded.current_a + noise_a)
+    moved_and_given = replace(moved, recording=given)
+    other_cell = replace(three_axis_cell, digest="other", recording_digest="other")
+
+    serve(monkeypatch, other_cell, [moved_and_given])
+    validated = cross_validate({"one": calibration}, [Path("r6")], other_cell)
+    assert said(validated.diagnoses) == {"zero-off r6 J2"}
+    assert "the given cell file has another number here" in validated.diagnoses[0].remedy
+
+    serve(monkeypatch, other_cell, [moved])
+    validated = cross_validate({"one": calibration}, [Path("r6")], other_cell)
+    assert said(validated.diagnoses) == set()
+
     # A calibration of the same description predicts in the same geometry.
-    made_with_it = replace(calibration, recording_configuration_sha256=other.recording_digest)
-    assert replaced_geometry(made_with_it, moved, other) == ()
+    made_with_it = replace(calibration, recording_configuration_sha256="other")
+    assert replaced_geometry(made_with_it, moved_and_given, other_cell) == ()
 
 
 def test_a_zero_that_a_fit_has_named_is_named_after_a_search_that_finds_nothing(
     three_axis_cell: Cell, recorded: Runs, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    runs = {run.name: offset(run) for run in recorded}
-    monkeypatch.setattr(fit_module, "load_run", lambda path, *_: (runs[path.name], three_axis_cell))
-    logs = [Path(f"r{number}") for number in range(USED)]
-    fitted = fit(logs)
-    evidence = fitted.evidence()
+    serve(monkeypatch, three_axis_cell, map(offset, recorded))
+    fitted = fit(LOGS)
     limits_nm = np.zeros(3)
-    step = Step((), (), limits_nm, None, evidence, declared=True)
-    changed_fitted = replace(fitted, steps=(step,))
-    beside_declared = description_diagnoses(changed_fitted)
-    assert said(beside_declared) == {"zero-off J2"}
-    steps = (replace(step, declared=False),)
-    after_search = description_diagnoses(replace(fitted, steps=steps))
-    assert said(after_search) == {"zero-off J2"}
+    found_nothing = Step((), (), limits_nm, None, fitted.evidence(), declared=True)
+    beside_declared = replace(fitted, steps=(found_nothing,))
+    assert said(description_diagnoses(beside_declared)) == {"zero-off J2"}
+    after_search = replace(fitted, steps=(replace(found_nothing, declared=False),))
+    assert said(description_diagnoses(after_search)) == {"zero-off J2"}
 
 
 def test_a_zero_that_the_search_has_set_aside_is_named_and_one_in_its_noise_is_not(
     three_axis_cell: Cell, recorded: Runs, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    runs = {run.name: run for run in recorded}
-    monkeypatch.setattr(fit_module, "load_run", lambda path, *_: (runs[path.name], three_axis_cell))
-    logs = [Path(f"r{number}") for number in range(USED)]
-    fitted = fit(logs)
+    serve(monkeypatch, three_axis_cell, recorded)
+    fitted = fit(LOGS)
     std = np.radians(0.1)
     finding = passed_finding(ZeroOffset(), 1, np.radians(-4.0), std)
     aside = SetAside(finding, "the squared error on runs left out rises")
     limits_nm = np.zeros(3)
     step = Step((), (), limits_nm, None, fitted.evidence(), set_aside=(aside,))
-    changed_fitted = replace(fitted, steps=(step,))
-    (diagnosis,) = description_diagnoses(changed_fitted)
+
+    (diagnosis,) = description_diagnoses(replace(fitted, steps=(step,)))
     assert (diagnosis.name, diagnosis.axes) == ("zero-off", ("J2",))
     assert "off by -4.00 ± 0.10°" in diagnosis.found
-    assert (
-        "the gains are without this correction (the squared error on runs left out rises)"
-    ) in diagnosis.found
+    reason = "the gains are without this correction (the squared error on runs left out rises)"
+    assert reason in diagnosis.found
+
     # Beside a delay that the moves do not tell from it, it is one diagnosis, and no number is to be
     # typed in.
     late = passed_finding(LatePosition(), 1, 0.002, 1e-4)
-    alike = (AlikeCorrections((finding, late), ()),)
-    check = GeometryCheck(gravity=None, mistakes=(), hidden_zeros=(), alike=alike)
+    alike = AlikeCorrections((finding, late), ())
+    check = GeometryCheck(gravity=None, mistakes=(), hidden_zeros=(), alike=(alike,))
     (unclear,) = description_diagnoses(replace(fitted, steps=(step,), description=check))
     assert unclear.name == "correction-unclear"
     assert "the zero of J2 off by -4.00 ± 0.10°" in unclear.found
     assert "or the position of J2 late by 2.00 ± 0.10 ms" in unclear.found
     assert "correct nothing in the cell file before that" in unclear.remedy
+
     left_open = (PlacedEffect(ZeroOffset(), 1),)
     in_its_noise = replace(step, left_open=left_open)
     assert description_diagnoses(replace(fitted, steps=(in_its_noise,))) == ()
@@ -470,53 +518,51 @@ def test_an_undecided_zero_is_named_and_refuses_the_gains_and_is_in_their_sigma(
     three_axis_cell: Cell, recorded: Runs, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A held-out run of three seconds decides nothing."""
-    time_s = recorded[6].time_s
-    position_rad = recorded[6].position_rad
-    current_a = recorded[6].current_a
+    held_out = recorded[6]
+    beginning = slice(0, 600)
     short = replace(
-        recorded[6],
-        time_s=time_s[:600],
-        position_rad=position_rad[:600],
-        current_a=current_a[:600],
+        held_out,
+        time_s=held_out.time_s[beginning],
+        position_rad=held_out.position_rad[beginning],
+        current_a=held_out.current_a[beginning],
     )
-    runs = {run.name: replace(offset(run), digest=run.name) for run in (*recorded[:USED], short)}
-    monkeypatch.setattr(fit_module, "load_run", lambda path, *_: (runs[path.name], three_axis_cell))
-    monkeypatch.setattr(fit_module, "find_effects", partial(find_effects, families=FEW_FAMILIES))
-    logs = [Path(f"r{number}") for number in range(USED)]
-    holdout = [Path("r6")]
-    fitted = fit(logs, holdout=holdout, keep_rows=True)
+    runs = [replace(offset(run), digest=run.name) for run in (*recorded[:USED], short)]
+    serve(monkeypatch, three_axis_cell, runs)
+    search_few_families(monkeypatch)
+    fitted = fit(LOGS, holdout=[Path("r6")], keep_rows=True)
     closed = close_loop(fitted, 0)
     last_step = closed.steps[-1]
     assert last_step.after.effects == ()
-    (verdict,) = closed.steps[-1].verdicts
+    (verdict,) = last_step.verdicts
     assert verdict.judgement is Judgement.UNDECIDED
-    named = [one for one in closed.diagnoses if one.name == "zero-off"]
-    axes = [one.axes for one in named]
-    assert axes == [("J2",)]
-    assert "held-out runs do not decide it" in named[0].found
+    (zero_off,) = (one for one in closed.diagnoses if one.name == "zero-off")
+    assert zero_off.axes == ("J2",)
+    assert "held-out runs do not decide it" in zero_off.found
     calibration = calibration_of(closed, WHEN)
     assert [one.name for one in uncorrected_description(calibration)] == ["zero-off"]
     assert np.all(closed.estimate.gains_std > fitted.estimate.gains_std)
+
+
+def _first_with_deviation(text: str) -> tuple[float, float]:
+    """The first "number ± deviation" of a text."""
+    found = re.search(r"([-+]\d+\.\d+) ± (\d+\.\d+)", text)
+    assert found is not None
+    return float(found[1]), float(found[2])
 
 
 def test_a_zero_that_a_search_has_corrected_is_named_with_its_deviation(
     three_axis_cell: Cell, recorded: Runs, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It was "about -35 deg", and gains and held-out errors of the corrected robot followed."""
-    runs = {
-        run.name: replace(offset(run, 35.0), digest=f"{int(run.name[1:]):064x}") for run in recorded
-    }
-    monkeypatch.setattr(fit_module, "load_run", lambda path, *_: (runs[path.name], three_axis_cell))
-    monkeypatch.setattr(fit_module, "find_effects", partial(find_effects, families=FEW_FAMILIES))
-    logs = [Path(f"r{number}") for number in range(USED)]
-    fitted = fit(logs, keep_rows=True)
+    serve(monkeypatch, three_axis_cell, [with_digest(offset(run, 35.0)) for run in recorded])
+    search_few_families(monkeypatch)
+    fitted = fit(LOGS, keep_rows=True)
     assert said(fitted.diagnoses) == {"zero-turned J2"}
     assert "gains and errors mean nothing until it is right" in fitted.diagnoses[0].remedy
     (found,) = close_loop(fitted, 0).diagnoses
     assert (found.name, found.axes) == ("zero-off", ("J2",))
-    matches = re.findall(r"([-+]\d+\.\d+) ± (\d+\.\d+)", found.found)
-    number, deviation = matches[0]
-    assert abs(float(number) + 35.0) < 4.0 * float(deviation) < 2.0
+    zero_deg, std_deg = _first_with_deviation(found.found)
+    assert abs(zero_deg + 35.0) < 4.0 * std_deg < 2.0
 
 
 @pytest.mark.parametrize("json", [False, True])
@@ -531,15 +577,13 @@ def test_gains_that_mean_nothing_are_refused(
     json: bool,
 ) -> None:
     """They ended with exit code 0, beside a CHECK that said so."""
-    runs = {
-        run.name: replace(run, digest=f"{int(run.name[1:]):064x}")
-        for run in map(reversed_position, recorded)
-    }
-    monkeypatch.setattr(fit_module, "load_run", lambda path, *_: (runs[path.name], three_axis_cell))
-    monkeypatch.setattr(fit_module, "find_effects", partial(find_effects, families=FEW_FAMILIES))
+    serve(monkeypatch, three_axis_cell, [with_digest(reversed_position(run)) for run in recorded])
+    search_few_families(monkeypatch)
     out = tmp_path / "calibration.yaml"
-    command = [verb, *(f"r{number}" for number in range(USED)), "--out", str(out)]
-    assert main([*command, *(["--json"] if json else [])]) == ExitCode.DATA_UNFIT
+    command = [verb, *map(str, LOGS), "--out", str(out)]
+    if json:
+        command.append("--json")
+    assert main(command) == ExitCode.DATA_UNFIT
     text, said_on_stderr = capsys.readouterr()
     assert "a position that counts the other way" in said_on_stderr
     assert "gains and errors mean nothing until it is right" in said_on_stderr
@@ -555,8 +599,8 @@ def test_what_is_said_of_another_run_leaves_the_gains_as_they_are() -> None:
         "position-reversed", ("held-out",), ("J2",), "a position", "another", "reverse it"
     )
     assert geometry_refusal((of_run,)) is None
-    diagnoses = (of_run, replace(of_run, runs=()))
-    refused = geometry_refusal(diagnoses)
+    of_fit = replace(of_run, runs=())
+    refused = geometry_refusal((of_run, of_fit))
     assert refused is not None
     assert str(refused).startswith("J2")
 
@@ -565,16 +609,16 @@ def test_a_lean_that_a_zero_explains_as_well_is_named_with_it_and_no_number_is_t
     three_axis_cell: Cell, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     truth = three_axes_truth()
-    lean = np.radians(2.0)
-    gravity_m_s2 = 9.81 * np.array([np.sin(lean), 0.0, -np.cos(lean)])
-    model = with_gravity(truth.model, gravity_m_s2)
-    leaning = replace(truth, model=model)
+    lean_rad = np.radians(2.0)
+    gravity_m_s2 = 9.81 * np.array([np.sin(lean_rad), 0.0, -np.cos(lean_rad)])
+    leaning = replace(truth, model=with_gravity(truth.model, gravity_m_s2))
     rng = np.random.default_rng(8)
-    less = np.array([0.06, 1.0, 1.0])  # J1 hardly moves
-    runs: dict[str, Run] = {}
-    for number in range(4):
-        payload = MOUNTED if number % 2 else None
-        run = record(
+
+    def with_j1_hardly_moving(position_rad: FloatArray) -> FloatArray:
+        return np.asarray(position_rad * np.array([0.06, 1.0, 1.0]))
+
+    runs = [
+        record(
             leaning,
             f"r{number}",
             rng,
@@ -582,13 +626,12 @@ def test_a_lean_that_a_zero_explains_as_well_is_named_with_it_and_no_number_is_t
             seconds=15.0,
             noise_a=0.1,
             rate_hz=500.0,
-            bend=lambda q: q * less,
+            bend=with_j1_hardly_moving,
         )
-        digest = f"{number:064x}"
-        runs[run.name] = replace(run, digest=digest)
-    monkeypatch.setattr(fit_module, "load_run", lambda path, *_: (runs[path.name], three_axis_cell))
-    logs = [Path(f"r{number}") for number in range(4)]
-    fitted = fit(logs, gains_fixed=True)
+        for number, payload in enumerate((None, MOUNTED, None, MOUNTED))
+    ]
+    serve(monkeypatch, three_axis_cell, map(with_digest, runs))
+    fitted = fit(LOGS[:4], gains_fixed=True)
     (found,) = fitted.diagnoses
     assert (found.name, found.axes) == ("correction-unclear", ("J2",))
     assert "the zero of J2 off by" in found.found
@@ -603,35 +646,29 @@ def test_a_lean_that_a_zero_explains_as_well_is_named_with_it_and_no_number_is_t
 
 def test_each_hidden_zero_has_its_own_reason(three_axis_cell: Cell) -> None:
     robot = three_axes_truth().model.robot
-    hidden_zeros = (0, 1, 2)
-    check = GeometryCheck(gravity=None, mistakes=(), hidden_zeros=hidden_zeros)
-    text = hidden_zeros_text(check, three_axis_cell.axis_names, robot)
+    axis_names = three_axis_cell.axis_names
+    check = GeometryCheck(gravity=None, mistakes=(), hidden_zeros=(0, 1, 2))
+    text = hidden_zeros_text(check, axis_names, robot)
     assert "of J1: another one turns or shifts the whole arm" in text
     assert "of J3: no joint is behind it" in text
     assert "of J2: these moves do not show it" in text
-    changed_check = replace(check, hidden_zeros=())
-    assert hidden_zeros_text(changed_check, three_axis_cell.axis_names, robot) == ""
+    without_hidden = replace(check, hidden_zeros=())
+    assert hidden_zeros_text(without_hidden, axis_names, robot) == ""
 
 
 def test_the_key_that_is_named_reverses_a_position_and_no_current(
     three_axis_cell: Cell, recorded: Runs, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    runs = {
-        run.name: replace(run, digest=f"{int(run.name[1:]):064x}")
-        for run in map(reversed_position, recorded)
-    }
-    monkeypatch.setattr(fit_module, "load_run", lambda path, *_: (runs[path.name], three_axis_cell))
-    logs = [Path(f"r{number}") for number in range(USED)]
-    (diagnosis,) = fit(logs, keep_rows=True).diagnoses
+    serve(monkeypatch, three_axis_cell, [with_digest(reversed_position(run)) for run in recorded])
+    (diagnosis,) = fit(LOGS, keep_rows=True).diagnoses
     assert (diagnosis.name, diagnosis.axes) == ("position-reversed", ("J2",))
     assert "the row of J2 in `drive_train.ratio`" in diagnosis.remedy
     declared = three_axis_cell.ratio
-    corrected = declared * np.array([1.0, -1.0, 1.0])[:, None]
+    corrected = declared.copy()
+    corrected[1] = -declared[1]
     # The way from motor to joint turns for J2 alone, and the torque of a motor at its joint stays.
-    counts = np.array([1.0, 2.0, 3.0])
-    corrected_inverse = np.linalg.inv(corrected)
-    declared_inverse = np.linalg.inv(declared)
-    turned_rad = corrected_inverse @ counts / (declared_inverse @ counts)
-    expected = [1.0, -1.0, 1.0]
-    np.testing.assert_allclose(turned_rad, expected)
+    motor_rad = np.array([1.0, 2.0, 3.0])
+    declared_rad = np.linalg.solve(declared, motor_rad)
+    corrected_rad = np.linalg.solve(corrected, motor_rad)
+    np.testing.assert_allclose(corrected_rad / declared_rad, [1.0, -1.0, 1.0])
     np.testing.assert_allclose(DriveTrain(corrected).direction, DriveTrain(declared).direction)
