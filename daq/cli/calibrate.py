@@ -414,7 +414,7 @@ def calibrate_verb(options: CalibrateOptions) -> None:
     journal = Story(sys.stderr, Form.TEXT, lambda: datetime.now(UTC))
 
     try:
-        with interruptible() as block_signals, Feed(options.cell) as feed:
+        with interruptible(moves_again=True) as block_signals, Feed(options.cell) as feed:
             looks = Looks(feed, journal)
             tools = _tools(options.cell, declared, looks)
             if options.check:

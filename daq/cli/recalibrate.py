@@ -94,7 +94,7 @@ def _run(cell: Path, dry_run: bool, now: bool, json: bool, journal: Journal) -> 
     if now and declared.recalibration is not None:
         declared = replace(declared, recalibration=replace(declared.recalibration, every_h=0.0))
     who = f"drivegain recalibrate, {login()}"
-    with interruptible() as block_signals, Feed(cell) as feed:
+    with interruptible(moves_again=True) as block_signals, Feed(cell) as feed:
         tools = Tools(
             save_report=partial(save_certificate, cell, declared), record=partial(record, feed=feed)
         )

@@ -558,7 +558,10 @@ ONE_KEY_S = 0.3  #: Signals that are closer together count as one
 
 @contextmanager
 def interruptible(
-    clock: Callable[[], float] = time.monotonic, signals: tuple[signal.Signals, ...] = SIGNALS
+    clock: Callable[[], float] = time.monotonic,
+    signals: tuple[signal.Signals, ...] = SIGNALS,
+    *,
+    moves_again: bool = False,
 ) -> Iterator[SignalBlocker]:
     """Turn signals within the block into KeyboardInterrupt,
     and ignore those that follow within `GRACE_S`.
@@ -572,6 +575,12 @@ def interruptible(
     a function that returns whether a second signal came, after which the settings of the axes need
     not be restored any more. Outside the main thread, where Python handles no signals, nothing
     changes.
+
+    Args:
+        clock: monotonic [s].
+        signals: that interrupt.
+        moves_again: the command may go on to another motion after the protected end of a good one.
+            A signal that came meanwhile is then raised behind it.
     """
     if threading.current_thread() is not threading.main_thread():
         yield nullcontext
@@ -594,11 +603,16 @@ def interruptible(
     def block_signals() -> Iterator[Callable[[], bool]]:
         nonlocal blocked_until_s
         earlier_s = blocked_until_s
+        is_stopping = sys.exception() is not None or clock() < earlier_s
+        seen_before = signals_seen
         blocked_until_s = max(blocked_until_s, clock() + GRACE_S)
         try:
             yield lambda: signals_seen > 1
         finally:
             blocked_until_s = earlier_s
+        if moves_again and signals_seen > seen_before and not is_stopping:
+            blocked_until_s = clock() + GRACE_S
+            raise KeyboardInterrupt
 
     with _handled_by(interrupt, signals):
         yield block_signals

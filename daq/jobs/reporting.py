@@ -94,6 +94,8 @@ def report_failure(context: SessionContext, folder: Path, error: BaseException) 
             code = exit_code(type(error)) or ExitCode.UNEXPECTED
         if str(error):
             problem = f"{type(error).__name__}: {error}"
+        elif interrupted:
+            problem = "interrupted"
         else:
             problem = type(error).__name__
         remark = "; ".join((problem, *stop_notes(error)))

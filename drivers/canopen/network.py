@@ -199,18 +199,21 @@ class CanopenNetwork:
         return self
 
     def __exit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
+        problems: list[DriverError] = []
+        is_restored = False
         try:
             with self.block_signals() as asked_again:
                 if self._setups:
                     problems = self._restore(asked_again or never)
-                else:
-                    problems = []
+                is_restored = True
         except BaseException as cut:
-            cut.add_note(
-                f"{WHILE}closing the network: it was cut short, and not every axis has "
-                "its settings back"
-            )
-            self._note(cut, ())
+            # A signal that came meanwhile is raised behind it.
+            if not is_restored:
+                cut.add_note(
+                    f"{WHILE}closing the network: it was cut short, and not every axis has "
+                    "its settings back"
+                )
+            self._note(cut, problems)
             raise
         finally:
             self.link.close()

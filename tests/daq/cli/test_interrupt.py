@@ -81,6 +81,41 @@ def test_what_must_not_be_disturbed_is_not_for_as_long_as_a_stop_takes() -> None
                 signal.raise_signal(signal.SIGINT)  # a hanging stop can be left
 
 
+@pytest.mark.parametrize("moves_again", [False, True])
+def test_a_signal_at_the_end_of_a_good_run_stops_a_job_that_would_move_again(
+    moves_again: bool,
+) -> None:
+    """It was dropped, and the job mounted the payload and recorded the next run."""
+    now_s = 100.0
+    went_on = False
+    with interruptible(lambda: now_s, moves_again=moves_again) as block_signals:
+        try:
+            with block_signals() as asked_again:
+                signal.raise_signal(signal.SIGTERM)
+                assert asked_again is not None
+                assert not asked_again()  # the settings are restored all the same
+            went_on = True
+        except KeyboardInterrupt:
+            signal.raise_signal(signal.SIGTERM)  # the stop that has begun has its time
+    assert went_on is not moves_again
+
+
+def test_a_signal_during_a_stop_that_an_error_or_a_signal_has_begun_is_dropped() -> None:
+    now_s = 100.0
+    with interruptible(lambda: now_s, moves_again=True) as block_signals:
+        with pytest.raises(DriveFault):
+            try:
+                raise DriveFault(3, "EMCY 7305h")
+            finally:
+                with block_signals():
+                    signal.raise_signal(signal.SIGINT)
+        now_s += 2 * GRACE_S
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+        with block_signals():
+            signal.raise_signal(signal.SIGINT)
+
+
 def test_a_second_signal_gives_up_restoring_and_one_key_is_one_signal() -> None:
     now_s = 100.0
     with interruptible(lambda: now_s) as block_signals:

@@ -10,6 +10,7 @@ import select
 import signal
 import socket
 import tracemalloc
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, replace
 from datetime import timedelta
@@ -43,7 +44,8 @@ from daq.ledger.ledger import Ledger
 from daq.workflow.bus_lock import bus_lock, lock_name
 from daq.workflow.interlock import MAX_OUTPUT_CHARACTERS, Finished, require_release, run_command
 from daq.workflow.record import Recorded, RecordingRequest
-from drivers.errors import MotionRefused
+from drivers.canopen.network import CanopenNetwork
+from drivers.errors import DriverError, MotionRefused
 from drivers.simulation.drive import PowerState
 from tests.daq.histories import calibration_of, digest_of
 from tests.daq.jobs.made import Made, made_rig
@@ -429,6 +431,37 @@ def test_a_service_manager_that_ends_the_job_ends_the_motion(
     assert rig.session.state.exit_code == ExitCode.INTERRUPTED
     details = rig.audit[-1].details
     assert details["outcome"] == "interrupted"
+
+
+@pytest.mark.slow
+def test_a_job_that_is_ended_while_a_good_run_closes_moves_no_more(
+    tmp_path: Path, one_move: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The signal was dropped: the job mounted the payload and recorded the next runs."""
+    folder = tmp_path / "cell"
+    rig = make_rig(folder, one_move)
+    restore = CanopenNetwork._restore
+    closed: list[CanopenNetwork] = []
+
+    def ended_meanwhile(
+        network: CanopenNetwork, asked_again: Callable[[], bool]
+    ) -> list[DriverError]:
+        if not closed and list(folder.rglob("*.mcap")):
+            closed.append(network)
+            signal.raise_signal(signal.SIGTERM)
+        return restore(network, asked_again)
+
+    monkeypatch.setattr(CanopenNetwork, "_restore", ended_meanwhile)
+    with serving(rig) as cell:
+        with (
+            interruptible(moves_again=True) as block_signals,
+            pytest.raises(KeyboardInterrupt) as interrupt,
+        ):
+            rig.job(block_signals=block_signals)
+        assert powerless(cell)
+    assert not hasattr(interrupt.value, "__notes__")
+    assert len(list(folder.rglob("*.mcap"))) == 1
+    assert rig.session.state.outcome is Outcome.INTERRUPTED
 
 
 def test_a_disk_that_is_full_is_reported_before_and_during_a_run(
