@@ -414,9 +414,12 @@ def fold(entries: Sequence[AuditEntry], cell: Cell) -> History:
     unreadable: list[str] = []
     calibrations = entered_calibrations(entries, cell.name)
     by_order = times_by_order([one.at for one in calibrations])
+    # Of two calibrations alone, nobody could say which clock was wrong: all entries must agree.
+    corrected = _corrected_times(entries)
     # Of logs, by calibrations that were entered while the clock was right
     recorded: dict[str, datetime] = {}
-    for one, time in zip(calibrations, by_order, strict=True):
+    for one, by_calibrations in zip(calibrations, by_order, strict=True):
+        time = by_calibrations if one.number in corrected else None
         try:
             figures = one.figures or figures_of_document(one)
             entry = entry_of(
@@ -733,18 +736,31 @@ def _identity(one: AuditEntry) -> object:
 
 
 def _times_by_number(entries: Sequence[AuditEntry]) -> dict[int, datetime]:
-    """Return when entries were written, by their numbers, corrected where the clock was wrong.
+    """Return when entries were written, by their numbers, corrected where the clock was wrong."""
+    stamped = _stamped_times(entries)
+    return stamped | _corrected_times(entries)
+
+
+def _corrected_times(entries: Sequence[AuditEntry]) -> dict[int, datetime]:
+    """Return when those entries were written whose clock was wrong, by their numbers."""
+    stamped = _stamped_times(entries)
+    by_order = times_by_order(list(stamped.values()))
+    by_number = zip(stamped, by_order, strict=True)
+    return {number: time for number, time in by_number if time is not None}
+
+
+def _stamped_times(entries: Sequence[AuditEntry]) -> dict[int, datetime]:
+    """Return the times of entries by their clock, by their numbers.
 
     A write that was found has the time of the write, which is out of the order of the log by
     intent.
     """
-    timed = []
+    stamped = {}
     for one in entries:
         at = at_of(one)
         if at is not None and one.action is not AuditAction.WRITE_FOUND:
-            timed.append((one.number, at))
-    by_order = times_by_order([at for _, at in timed])
-    return {number: time or at for (number, at), time in zip(timed, by_order, strict=True)}
+            stamped[one.number] = at
+    return stamped
 
 
 def _place(found: Sequence[AuditedWrite], one: AuditEntry, times: Mapping[int, datetime]) -> int:

@@ -173,6 +173,20 @@ def test_a_write_that_was_found_is_in_force_after_one_of_a_wrong_later_date(tmp_
     assert history.in_force(target) == digests[2]
 
 
+def test_a_right_calibration_is_not_misdated_by_one_of_a_clock_that_was_behind(
+    tmp_path: Path,
+) -> None:
+    """Of two calibrations nobody could say which clock was wrong; the other entries say it."""
+    ledger = ledger_in(tmp_path)
+    right = enter_at(ledger, calibration_of(20), week(20))
+    target = drives_of(ledger.cell.name)
+    write(ledger, target, "a" * 64, digest=right, at=week(20))
+    enter_at(ledger, calibration_of(21), week(16))
+    entries = {entry.digest: entry for entry in read_history(ledger).entries}
+    assert entries[right].created_by_clock is None
+    assert entries[right].created == week(20)
+
+
 def test_times_in_order_are_left_alone() -> None:
     times = [week(number) for number in (0, 1, 1, 5)]
     assert times_by_order(times) == (None,) * 4
