@@ -354,9 +354,9 @@ class OutputFailed(DaqError):
                 remedy="it is as it was; ask who set the mark and why, take it off "
                 f"(`chattr -i -a {shlex.quote(str(error.marked))}`), then repeat the command",
             )
-        no_folder = cls._of_file_in_the_way(path) or cls.of_missing_folder(path, error)
-        if no_folder is not None:
-            return no_folder
+        missing = cls.of_missing_folder(path, error)
+        if missing is not None:
+            return missing
         if error.errno == errno.ENAMETOOLONG:
             return cls(
                 str(path),
@@ -373,26 +373,22 @@ class OutputFailed(DaqError):
         )
 
     @classmethod
-    def _of_file_in_the_way(cls, path: Path) -> OutputFailed | None:
-        """Make the error for an output below a file; None where each folder above it is one."""
-        for above in path.parents:
-            if above.is_dir():
-                return None
-            if above.exists():
-                return cls(
-                    str(path),
-                    found=f"{above} is a file",
-                    expected="folders alone above the output",
-                    remedy="nothing was written; choose another folder",
-                )
-        return None
-
-    @classmethod
     def of_missing_folder(cls, path: Path, error: OSError) -> OutputFailed | None:
-        """Make the error for a file whose folder is not there; None for another reason."""
-        is_missing = error.errno in {errno.ENOENT, errno.ENOTDIR}
+        """Make the error for a file whose folder is not there, or is a file; None for another
+        reason.
+        """
+        # Only of these errors: another may say that the folders above cannot be looked at.
+        is_missing = error.errno in {errno.ENOENT, errno.ENOTDIR, errno.EEXIST}
         if not is_missing or path.parent.is_dir():
             return None
+        above = next(folder for folder in path.absolute().parents if folder.exists())
+        if not above.is_dir():
+            return cls(
+                str(path),
+                found=f"{above} is a file",
+                expected="a folder above the output",
+                remedy="nothing was written; choose another folder",
+            )
         return cls(
             str(path),
             found=f"no folder {path.parent}",

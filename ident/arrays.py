@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import wraps
 from numbers import Real
 from types import UnionType
-from typing import ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeGuard, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -206,7 +206,7 @@ def require_size(label: str, array: FloatArray, refuse: Refusal, remedy: str) ->
     )
 
 
-def is_whole_number(value: object) -> bool:
+def is_whole_number(value: object) -> TypeGuard[int | np.integer[Any]]:
     """Whether it is an integer of Python or numpy; True and False are none."""
     return isinstance(value, (int, np.integer)) and not isinstance(value, bool)
 
@@ -219,11 +219,11 @@ def require_no_flag(label: str, value: object, remedy: str) -> None:
 
 def require_count(label: str, value: object, *, remedy: str = "give a number such as 0") -> int:
     """Return a whole number, zero or above; refuse others, as a `ModelError`."""
-    if not is_whole_number(value) or value < 0:  # type: ignore[operator]
+    if not is_whole_number(value) or value < 0:
         raise ModelError(
             f"{label} is {value!r:.60}; expected a whole number, zero or above; {remedy}"
         )
-    return int(value)  # type: ignore[call-overload, no-any-return]
+    return int(value)
 
 
 def takes(

@@ -131,7 +131,7 @@ def record_verb(options: RecordOptions) -> None:
         _add_what_is_kept(error, declared, part)
         raise
     for warning in done.warnings:
-        if warning not in before_motion:
+        if warning not in before_motion:  # that of a bus without room comes at both times
             say(warning, err=True)
     if options.json:
         print_json(record_report(out, done, declared))

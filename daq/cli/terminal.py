@@ -580,7 +580,7 @@ def interruptible(
         clock: monotonic [s].
         signals: that interrupt.
         moves_again: the command may go on to another motion after the protected end of a good one.
-            A signal that came meanwhile is then raised behind it.
+            A signal that came during this end is then raised after it.
     """
     if threading.current_thread() is not threading.main_thread():
         yield nullcontext

@@ -249,7 +249,7 @@ def append(
         try:
             _note_head(path, content, new.sha256)
         except OSError as error:
-            # What fails last, as a close, may have come after all of the note was taken.
+            # A close can fail after the complete note was written.
             is_noted = noted_heads(path)[-1:] == (new.sha256,)
             if is_first and not is_noted:
                 _LOG.warning("%s", _says_not_noted(path, error))

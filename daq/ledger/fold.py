@@ -414,8 +414,8 @@ def fold(entries: Sequence[AuditEntry], cell: Cell) -> History:
     unreadable: list[str] = []
     calibrations = entered_calibrations(entries, cell.name)
     by_order = times_by_order([one.at for one in calibrations])
-    # Of two calibrations alone, nobody could say which clock was wrong: all entries must agree.
-    corrected = _corrected_times(entries)
+    # Two calibrations alone do not show which clock was wrong: the other entries must agree.
+    corrected = _corrected_times(_stamped_times(entries))
     # Of logs, by calibrations that were entered while the clock was right
     recorded: dict[str, datetime] = {}
     for one, by_calibrations in zip(calibrations, by_order, strict=True):
@@ -738,12 +738,15 @@ def _identity(one: AuditEntry) -> object:
 def _times_by_number(entries: Sequence[AuditEntry]) -> dict[int, datetime]:
     """Return when entries were written, by their numbers, corrected where the clock was wrong."""
     stamped = _stamped_times(entries)
-    return stamped | _corrected_times(entries)
+    return stamped | _corrected_times(stamped)
 
 
-def _corrected_times(entries: Sequence[AuditEntry]) -> dict[int, datetime]:
-    """Return when those entries were written whose clock was wrong, by their numbers."""
-    stamped = _stamped_times(entries)
+def _corrected_times(stamped: Mapping[int, datetime]) -> dict[int, datetime]:
+    """Return when the entries with a wrong clock were written, by their numbers.
+
+    Args:
+        stamped: of `_stamped_times`.
+    """
     by_order = times_by_order(list(stamped.values()))
     by_number = zip(stamped, by_order, strict=True)
     return {number: time for number, time in by_number if time is not None}

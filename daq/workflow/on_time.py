@@ -28,7 +28,7 @@ def defer_full_gc() -> Iterator[None]:
     A search through all that the program and its libraries have made takes tens of milliseconds, in
     which nothing else of the process runs: so many periods without SYNC at 1 kHz, and a run that is
     marked invalid. So what there is already is searched now, once: it would all be part of the
-    first search of the middle generation, which comes after a minute of recording.
+    first search of the middle generation, which comes within the first minute of a recording.
     """
     before = gc.get_threshold()
     gc.collect()

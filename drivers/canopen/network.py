@@ -207,7 +207,7 @@ class CanopenNetwork:
                     problems = self._restore(asked_again or never)
                 is_restored = True
         except BaseException as cut:
-            # A signal that came meanwhile is raised behind it.
+            # A signal that came while they were restored is raised after that.
             if not is_restored:
                 cut.add_note(
                     f"{WHILE}closing the network: it was cut short, and not every axis has "

@@ -300,7 +300,7 @@ def _require_place(label: str, place: Place, count: int) -> None:
 
 def _require_index(label: str, index: object, end: int, *, least: int = 0) -> None:
     """Refuse what is no index of a joint from `least` to below `end`, as a `ModelError`."""
-    if not is_whole_number(index) or not least <= index < end:  # type: ignore[operator]
+    if not is_whole_number(index) or not least <= index < end:
         raise ModelError(
             f"{label} is {index!r:.60}; expected a whole number from {least} to {end - 1}; "
             "give the index of a joint"

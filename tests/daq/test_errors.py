@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import importlib
 import inspect
 import pkgutil
@@ -116,3 +117,18 @@ def test_a_missing_folder_of_an_output_is_named(tmp_path: Path) -> None:
     (tmp_path / "none").write_text("a file")
     with pytest.raises(OutputFailed, match=r"found .*none is a file"), writing(path):
         path.write_text("")
+
+
+def test_folders_that_cannot_be_looked_at_do_not_hide_the_refusal(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It was a PermissionError without a word of what to do."""
+    closed = PermissionError(errno.EACCES, "Permission denied")
+
+    def refuse(_: Path) -> bool:
+        raise closed
+
+    monkeypatch.setattr(Path, "is_dir", refuse)
+    monkeypatch.setattr(Path, "exists", refuse)
+    error = OutputFailed.of(tmp_path / "x.csv", closed)
+    assert error.found == "permission denied"

@@ -359,7 +359,7 @@ def test_an_output_below_a_file_is_refused_with_the_name_of_the_file(
     file.touch()
     assert main(words) != ExitCode.OK
     said = " ".join(capsys.readouterr().err.split())
-    assert "found: file is a file" in said
+    assert f"{file} is a file" in said
     assert "free space" not in said
     assert list(tmp_path.iterdir()) == [file]
 

@@ -141,9 +141,9 @@ def _claim_holds(effect: Effect, claim: Property, axis: int, seed: int) -> bool:
     angle = s.motor_position_rad
     columns = effect.columns(s, axis)
 
-    def changed(**signals: FloatArray) -> FloatArray:
+    def changed(**signals: Any) -> FloatArray:
         """Columns with other signals."""
-        return effect.columns(replace(s, **signals), axis)  # type: ignore[arg-type]
+        return effect.columns(replace(s, **signals), axis)
 
     match claim:
         case Property.ODD_IN_VELOCITY:
