@@ -77,9 +77,15 @@ class Conditioning:
     def for_rates(cls, rates_hz: Iterable[float]) -> Self:
         """Return filters for recordings of some sampling rates:
         the usual ones, lower for slow recordings.
+
+        Raises:
+            ModelError: this is no list of numbers above zero.
         """
+        remedy = "give a list of sampling rates, such as [500.0]"
+        require_kind("rates_hz", rates_hz, Iterable, remedy)
         share = 1.0
         for rate_hz in rates_hz:
+            require_number("an entry of rates_hz", rate_hz, above=0.0, remedy=remedy)
             share = min(share, rate_hz / FULL_FILTER_HZ)
         usual = cls()
         return cls(
@@ -109,9 +115,13 @@ class Conditioning:
                 f"the filter of the calibration: found {given}; expected a list standstill_rad_s "
                 f"and numbers {numbers}; give `conditioning`, or fit again"
             )
+        for name, value in found.items():
+            if name != "standstill_rad_s":
+                require_number(f"{name} of the calibration's filter", value, remedy=remedy)
         order = round(found.pop("position_order"))
         current_order = round(found.pop("current_order"))
         speeds = tuple(found.pop("standstill_rad_s"))
+        _require_speeds(speeds)
         return cls(
             **found, position_order=order, current_order=current_order, standstill_rad_s=speeds
         )

@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ident.arrays import (
+    LARGEST_NUMBER,
+    SMALLEST_NUMBER,
     BoolArray,
     FloatArray,
     IntArray,
@@ -215,6 +217,9 @@ def usual_conditioning(runs: Iterable[Run]) -> Conditioning:
             time_s = np.asarray(run.time_s, dtype=np.float64)
         except (TypeError, ValueError, OverflowError):
             continue
-        if time_s.ndim == 1 and len(time_s) > 1 and 0.0 < time_s[-1] - time_s[0] < np.inf:
-            rates_hz.append(float((len(time_s) - 1) / (time_s[-1] - time_s[0])))
+        if time_s.ndim != 1 or len(time_s) < 2:
+            continue
+        duration_s = float(time_s[-1] - time_s[0])
+        if SMALLEST_NUMBER < duration_s < LARGEST_NUMBER:
+            rates_hz.append((len(time_s) - 1) / duration_s)
     return Conditioning.for_rates(rates_hz)

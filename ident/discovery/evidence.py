@@ -16,7 +16,7 @@ from ident.arrays import FloatArray, require_names, takes
 from ident.data.conditioning import Conditioning
 from ident.data.dataset import Dataset, differentiate
 from ident.data.demand import DemandCache, as_demanded, with_demand
-from ident.data.run import Run
+from ident.data.run import Run, SeenRuns
 from ident.data.run_channels import channels_of
 from ident.discovery.gates import own_unknowns, values_of
 from ident.effects.effect import PlacedEffect, effect_torque
@@ -29,12 +29,12 @@ from ident.effects.geometry_corrections import (
 from ident.effects.rotor import beside_rotors
 from ident.effects.signals import Signals, fitted_signals, session_began_s
 from ident.equations.observation import Observation, observe, on_demanded_motion
-from ident.equations.reduction import reduce_built, regrouped
+from ident.equations.reduction import mounting_index, reduce_built, regrouped
 from ident.equations.rows import rows_of
 from ident.equations.system import System
 from ident.errors import ModelError
 from ident.estimators.estimate import Estimate, Identification, RelativeError
-from ident.estimators.identify import estimate_with
+from ident.estimators.identify import each_run, estimate_with
 from ident.estimators.method import Method
 from ident.model.model import Column, Model
 
@@ -115,26 +115,20 @@ def gather(
     unless it has kept them.
 
     Raises:
-        ModelError: no runs are given, and the identification has kept none; or an argument is of
-            another type.
-        DataUnfit: a run is unfit.
+        ModelError: the runs are not those of the fit, and the identification has kept none; or an
+            argument is of another type.
+        DataUnfit: a run is unfit, is given twice, or carries what no run of the fit has carried.
     """
     model = found.model
     conditioning = found.conditioning
     if found.gathered is None:
-        trained = [differentiate(run, model.drive_train, conditioning) for run in runs]
-        if not trained:
-            of_fit = ", ".join(found.system.runs)
-            raise ModelError(
-                f"gather was given no runs; expected those of the fit, {of_fit}, which it has not "
-                "kept; write gather(found, [bare, loaded])"
-            )
-        datasets = (
-            *trained,
-            *(differentiate(run, model.drive_train, conditioning) for run in holdout),
-        )
+        seen = SeenRuns()
+        trained = _differentiated(found, each_run(runs, seen, found.system.payloads))
+        _require_runs_of_fit(found, trained)
+        unseen = _differentiated(found, each_run(holdout, seen, found.system.payloads))
+        datasets = (*trained, *unseen)
         rows = observe(model, datasets, conditioning, found.system)
-        held_out = len(datasets) - len(trained)
+        held_out = len(unseen)
     else:
         datasets, rows = found.gathered
         held_out = len(datasets) - len(found.system.runs)
@@ -144,6 +138,37 @@ def gather(
     )
     evidence._identification.append(found)
     return evidence
+
+
+def _differentiated(found: Identification, runs: Iterable[Run]) -> list[Dataset]:
+    """Differentiate runs as those of a fit.
+
+    Raises:
+        DataUnfit: a run is unfit, or its mounting carried another payload in the fit.
+    """
+    payloads = list(found.system.payloads)
+    differentiated: list[Dataset] = []
+    for run in runs:
+        mounting_index(run.payload, payloads, run.name)
+        differentiated.append(differentiate(run, found.model.drive_train, found.conditioning))
+    return differentiated
+
+
+def _require_runs_of_fit(found: Identification, given: Sequence[Dataset]) -> None:
+    """Refuse other runs than those of a fit.
+
+    Raises:
+        ModelError: some are missing, or were not in it.
+    """
+    names = tuple(data.name for data in given)
+    if names == found.system.runs:
+        return
+    runs_given = ", ".join(names) or "no runs"
+    of_fit = ", ".join(found.system.runs)
+    raise ModelError(
+        f"gather was given {runs_given}; expected the runs of the fit, {of_fit}, which it has not "
+        "kept; write gather(found, [bare, loaded])"
+    )
 
 
 def place_names(model: Model, axes: Sequence[str]) -> list[str]:

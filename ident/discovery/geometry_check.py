@@ -547,6 +547,8 @@ def _stands_beside(
         rivals: everything else.
     """
     others = rivals.others(suspect)
+    if not others:  # no other effect could be fitted
+        return True
     best = others[0]
     is_best = suspect.left_out_fall >= best.left_out_fall
     if not is_best and not suspect.explains_beside(problem, rivals.torque_nm(problem, best)):

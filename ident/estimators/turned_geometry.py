@@ -306,6 +306,10 @@ def find_turned_geometry(
     if model.is_redundant or not instants:
         return None
     nameplate = as_array("gains", gains, (model.robot.axis_count,), "one per motor")
+    if not nameplate.all():
+        raise ModelError(
+            f"gains is {nameplate.tolist()}; expected no zero: such a motor moves nothing"
+        )
     reference = 1.0 / np.abs(nameplate)
     if not _is_suspect(model, _thinned(instants), reference):
         return None

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ident.arrays import FloatArray, as_array
+from ident.arrays import FloatArray, as_array, require_size
 from ident.errors import ModelError
 from ident.model.robot import Joint, Robot
 
@@ -105,6 +105,9 @@ class JointLimits:
         """
         lower = as_array("limits.lower", self.lower, (count,), "one per joint")
         upper = as_array("limits.upper", self.upper, (count,), "one per joint")
+        remedy = "give what the data sheet of the robot states, in SI units"
+        require_size("limits.lower", lower, ModelError, remedy)
+        require_size("limits.upper", upper, ModelError, remedy)
         if not np.all(lower < upper):
             found = f"positions from {lower.tolist()} to {upper.tolist()}"
             raise ModelError(f"limits: found {found}; expected each `lower` below its `upper`")
@@ -114,3 +117,4 @@ class JointLimits:
                 raise ModelError(
                     f"limits.{name}: found {values.tolist()}; expected numbers above zero"
                 )
+            require_size(f"limits.{name}", values, ModelError, remedy)

@@ -714,6 +714,80 @@ def test_a_seed_in_the_place_of_a_generator_and_one_effect_are_corrected(
         lax.identify(evidence.model, arguments["runs"], axes="ab")
 
 
+def _carrying(run: Any, payload: Any) -> Any:
+    return replace(run, name=f"{run.name} again", payload=payload)
+
+
+def test_runs_that_are_not_those_of_the_fit_are_refused_by_gather(
+    arguments: dict[str, Any],
+) -> None:
+    found = replace(arguments["found"], gathered=None)
+    bare, loaded = arguments["runs"]
+    with pytest.raises(ident.ModelError, match=rf"was given {bare.name}; expected the runs of the"):
+        ident.gather(found, [bare])
+    with pytest.raises(ident.ModelError, match="gather was given no runs; expected the runs of"):
+        ident.gather(found)
+    renamed = replace(loaded, name="yesterday")
+    with pytest.raises(ident.ModelError, match=rf"was given {bare.name}, yesterday; expected"):
+        ident.gather(found, [bare, renamed])
+    with pytest.raises(ident.DataUnfit, match="found the same samples, without load, as in run"):
+        ident.gather(found, [bare, loaded], [replace(bare, name="held out")])
+
+
+def test_a_held_out_run_with_another_payload_is_refused_by_gather(
+    arguments: dict[str, Any],
+) -> None:
+    found = replace(arguments["found"], gathered=None)
+    bare, loaded = arguments["runs"]
+    mounted = loaded.payload
+    shifted = replace(loaded, position_rad=loaded.position_rad + 0.01)
+    on_wall = _carrying(shifted, replace(mounted, mounting="wall"))
+    with pytest.raises(ident.DataUnfit, match="held out with mounting 'wall', which no run of the"):
+        ident.gather(found, [bare, loaded], [on_wall])
+    heavier = _carrying(shifted, replace(mounted, known={"m": 2.0 * mounted.known["m"]}))
+    with pytest.raises(ident.DataUnfit, match=f"mounting {mounted.mounting!r} carries"):
+        ident.gather(found, [bare, loaded], [heavier])
+
+
+@pytest.mark.parametrize("rates_hz", ["500", [0.0], [-1.0], [np.nan], [None], 500.0, [np.inf]])
+def test_sampling_rates_that_are_none_are_refused(rates_hz: Any) -> None:
+    with pytest.raises(ident.ModelError, match=r"rates_hz is .*; give a list of sampling rates"):
+        ident.Conditioning.for_rates(rates_hz)
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"position_order": "four"},
+        {"position_order": np.nan},
+        {"decimation_cutoff_hz": None},
+        {"standstill_share": True},
+        {"standstill_rad_s": ["slow"]},
+    ],
+)
+def test_settings_of_a_filter_that_are_no_numbers_are_refused(changed: dict[str, Any]) -> None:
+    document = {**ident.Conditioning().document(), **changed}
+    with pytest.raises(ident.ModelError, match=f"{next(iter(changed))} of the .* is "):
+        ident.Conditioning.of_document(document)
+
+
+@pytest.mark.parametrize("name", ["lower", "upper", "velocity", "acceleration"])
+def test_limits_that_no_robot_has_are_refused(arguments: dict[str, Any], name: str) -> None:
+    ones = np.ones(3)
+    limits = {"lower": -ones, "upper": ones, "velocity": ones, "acceleration": 2.0 * ones}
+    limits[name] = -1e300 * ones if name == "lower" else 1e300 * ones
+    with pytest.raises(ident.ModelError, match=rf"limits\.{name} has .*; expected at most 1e\+30"):
+        _planned(arguments, limits=ident.JointLimits(**limits))
+
+
+def test_a_gain_of_zero_is_refused_before_the_geometry_is_judged(
+    arguments: dict[str, Any],
+) -> None:
+    instants = arguments["found"].instants
+    with pytest.raises(ident.ModelError, match=r"gains is \[0.0, 1.0, 2.0\]; expected no zero"):
+        ident.find_turned_geometry(arguments["model"], instants, [0, 1, 2])
+
+
 def test_gains_by_name_are_told_how_to_become_a_list(arguments: dict[str, Any]) -> None:
     robot = arguments["model"].robot
     axes = [joint.name for joint in robot.axes]
