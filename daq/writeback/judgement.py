@@ -86,12 +86,9 @@ def query_history(
         _LOG.warning(MAY_LACK)
     if history.renamed is not None:
         _LOG.warning(
-            "cell %r was renamed to %r at %s: its history is under that name, so the current gains "
-            "are taken as exact; %s",
+            "the history of cell %r is under its name %r, so the current gains are taken as exact",
             cell.name,
             history.renamed.new,
-            history.renamed.at,
-            history.renamed.remedy,
         )
     return known_of(history, target, sha256(request.signed), changes)
 

@@ -27,11 +27,20 @@ from daq.arguments import (
     with_methods,
 )
 from daq.config.cell import Cell
-from daq.errors import AuditUnusable, CalibrationRefused, OutputFailed, counted, evidence, reason_of
+from daq.errors import (
+    AuditUnusable,
+    CalibrationRefused,
+    DaqError,
+    OutputFailed,
+    counted,
+    evidence,
+    reason_of,
+)
 from daq.files import sha256
 from daq.ledger.audit import BACKUPS_WITHOUT_LOG, GONE, AuditAction, AuditEntry, digest_now
 from daq.ledger.fold import WriteAction
 from daq.ledger.ledger import Ledger, enter_calibration, read_history, record_write
+from daq.ledger.names import RenamedCell
 from daq.writeback.file_access import backups_without_log
 from daq.writeback.gates.fit import OF_DESCRIPTION
 from daq.writeback.gates.gate import GateContext, Refusal
@@ -175,8 +184,23 @@ def propose(target: Target[E], request: Request) -> Proposal[E]:
     request.check_fields()
     target.check_fields()
     edit = target.plan(request.calibration)
-    refusals = check_gates(GateContext(request, edit, target.cell))
-    return Proposal(target, request, edit, refusals)
+    context = GateContext(request, edit, target.cell, _rename_of(target.cell))
+    return Proposal(target, request, edit, check_gates(context))
+
+
+def _rename_of(cell: Cell | None) -> RenamedCell | None:
+    """The rename after which the robot of a cell has another name; None without one.
+
+    A history that cannot be read tells of none: its own message says so.
+    """
+    if cell is None:
+        return None
+    ledger = Ledger.of(cell)
+    if ledger is None:
+        return None
+    with contextlib.suppress(DaqError):
+        return read_history(ledger).renamed
+    return None
 
 
 @checks_arguments(proposal=of_kind(Proposal), now=A_MOMENT, audit=optional(A_PATH), who=A_TEXT)

@@ -43,7 +43,13 @@ def cell(context: GateContext) -> Iterator[GateFinding]:
     if context.cell is None:
         return
     if found != context.cell.name:
-        yield "calibration", f"cell {found!r}", f"cell {context.cell.name!r}", "give its own --cell"
+        yield (
+            "calibration",
+            f"cell {found!r}",
+            f"cell {context.cell.name!r}",
+            "give the cell file of that robot; if it is this one under an earlier name, record "
+            "again",
+        )
         return
     differences = robot_differences(context.calibration.robot, calibrated_robot(context.cell))
     if differences:
@@ -53,6 +59,18 @@ def cell(context: GateContext) -> Iterator[GateFinding]:
             f"{expected_text(differences)}, as in the cell file",
             "give the cell file of the robot that was calibrated; of a cell that was changed "
             "since, record again",
+        )
+
+
+def former_name(context: GateContext) -> Iterator[GateFinding]:
+    """Refuse a cell file with a name that its robot had before a rename."""
+    renamed = context.renamed
+    if renamed is not None:
+        yield (
+            f"cell {renamed.old!r}",
+            f"a robot that was renamed to {renamed.new!r} at {renamed.at}",
+            "a cell file with its present name",
+            renamed.remedy,
         )
 
 

@@ -7,6 +7,7 @@ from enum import Enum
 
 from daq.config.cell import Cell
 from daq.config.policy import ApplyPolicy
+from daq.ledger.names import RenamedCell
 from daq.writeback.request import Edit, Request
 from ident.calibration import Calibration
 
@@ -61,6 +62,8 @@ class GateContext:
     edit: Edit  #: planned change of the target
     #: as it is now; None for a library without one, where nothing is compared with it
     cell: Cell | None = None
+    #: of the cell's robot, where the cell has the name from before it; None where it has not
+    renamed: RenamedCell | None = None
 
     @property
     def calibration(self) -> Calibration:

@@ -39,7 +39,11 @@ class GateRow:
 
 GATES: tuple[GateRow, ...] = (
     GateRow(Gate.NOT_IDENTIFIED, (target.identified,), "fit with a loaded run and free gains"),
-    GateRow(Gate.CELL, (fit.cell,), "use its own `--cell`"),
+    GateRow(
+        Gate.CELL,
+        (fit.cell, fit.former_name),
+        "give the cell file of that robot, with its present name",
+    ),
     GateRow(
         Gate.CONFIGURATION,
         (fit.configuration,),

@@ -691,6 +691,27 @@ def test_a_write_under_the_old_name_of_a_renamed_cell_is_rolled_back(
     assert targets == expected
 
 
+def test_the_old_file_of_a_renamed_cell_writes_nothing(address: BusAddress, tmp_path: Path) -> None:
+    demo = demo_cell(tmp_path)
+    press = replace(demo, name="press")
+    ledger = Ledger.of(press)
+    assert ledger is not None
+    acknowledge(Ledger.of(demo) or ledger, "J1", since=NOW, at=NOW, who="T", why="new gearbox")
+    rename_cell(ledger, plan_rename(ledger, "demo"), who="T", at=NOW)
+    with simulated(address) as simulation, network_of(demo, address) as network:
+        before = _gains(simulation)
+        proposal = _propose(demo, network)
+        with pytest.raises(
+            CalibrationRefused,
+            match=r"cell 'demo': found a robot that was renamed to 'press' at 2025-.*; expected a "
+            r"cell file with its present name; .*write its present name 'press'",
+        ):
+            apply(proposal, NOW, audit=ledger.audit, who="T")
+        assert _gains(simulation) == before
+        of_present_name = replace(demo_calibration(), cell="press")
+        assert _propose(press, network, of_present_name).refusals == ()
+
+
 @pytest.mark.parametrize("renamed_after_s", [-60, 60])
 def test_a_record_belongs_to_the_cell_that_had_its_name_at_that_time(
     address: BusAddress, tmp_path: Path, renamed_after_s: int
@@ -703,10 +724,13 @@ def test_a_record_belongs_to_the_cell_that_had_its_name_at_that_time(
     # Something under the old name, without which there is nothing to rename.
     acknowledge(Ledger.of(demo) or ledger, "J1", since=NOW, at=NOW, who="T", why="new gearbox")
     with simulated(address) as simulation:
+        with network_of(demo, address) as network:
+            proposal = _propose(demo, network)
         if renamed_after_s < 0:
             planned = plan_rename(ledger, "demo")
             rename_cell(ledger, planned, who="T", at=renamed_at)
-        _write(demo, address)
+        with network_of(demo, address) as network:
+            _apply(proposal, DriveTarget(demo, network), ledger.audit)
         if renamed_after_s > 0:
             rename = plan_rename(ledger, "demo")
             rename_cell(ledger, rename, who="T", at=renamed_at)
