@@ -37,6 +37,7 @@ from daq.errors import (
     ControllerChanged,
     ControllerUnfit,
     WriteUnconfirmed,
+    counted,
 )
 from daq.files import fsync_folder, replace_file, sha256
 from daq.formats.document import comment_behind, decode_document, read_controller_file
@@ -226,13 +227,15 @@ class FileTarget:
         # content.
         others = [one for one in found if before is None or one.was != short_digest(before)]
         if not others:
+            what = "no backup next to it"
+            if found:
+                what = f"{counted(len(found), 'backup')} with the same content"
             raise CalibrationRefused(
                 str(self.file),
-                found=f"{len(found)} backups with the same content"
-                if found
-                else "no backup next to it",
+                found=what,
                 expected=f"{target.name}.<time>.<digests>.bak with another content",
-                remedy="nothing was changed",
+                remedy="nothing was changed; drivegain has not written this file since, or its "
+                "backups were moved: copy the one that you want back next to it, or over it",
             )
         backup = others[-1]
         after = backup.content()

@@ -37,7 +37,15 @@ from daq.errors import (
     reason_of,
 )
 from daq.files import sha256
-from daq.ledger.audit import BACKUPS_WITHOUT_LOG, GONE, AuditAction, AuditEntry, digest_now
+from daq.ledger.audit import (
+    BACKUPS_WITHOUT_LOG,
+    GONE,
+    AuditAction,
+    AuditEntry,
+    Content,
+    digest_now,
+    verify,
+)
 from daq.ledger.fold import WriteAction
 from daq.ledger.ledger import Ledger, enter_calibration, read_history, record_write
 from daq.ledger.names import RenamedCell
@@ -301,6 +309,7 @@ def rollback(
     recorder = _Recorder(audit, who, now, subject)
     with recorder.refusals(refused_details):
         edit = planned or target.plan_rollback()
+    _warn_of_unmade_write(recorder)
     actions = (AuditAction.ROLLBACK_BEGUN, AuditAction.ROLLED_BACK)
     return _write(target, edit, recorder, actions, target.details(edit), refused_details)
 
@@ -365,6 +374,34 @@ def _write(
         if begun is not None:
             recorder.end(done_action, {"begun": begun.number})
         return written
+
+
+def _warn_of_unmade_write(recorder: _Recorder) -> None:
+    """Warn where the last write was begun and never made: the one before it is taken back then.
+
+    An audit log that cannot be read tells of none; what follows refuses it by name.
+    """
+    if recorder.audit is None:
+        return
+    try:
+        verdict = verify(recorder.audit)
+    except (AuditUnusable, OSError):
+        return
+    begun = [
+        one
+        for one in verdict.entries
+        if one.action in _BEGINNINGS and one.subject == recorder.subject
+    ]
+    unmade = [one.begun for one in verdict.open_writes if one.content is Content.BEFORE]
+    if not begun or begun[-1] not in unmade:
+        return
+    _LOG.warning(
+        "the last write to %s, begun by %s at %s, was never made, because its program was ended "
+        "before; the write before it is taken back now, and a second rollback brings it back",
+        recorder.subject,
+        begun[-1].who,
+        begun[-1].at,
+    )
 
 
 def _note_of_absent_log(recorder: _Recorder) -> dict[str, object]:
@@ -432,6 +469,7 @@ def _complete_history(proposal: Proposal[E], recorder: _Recorder) -> str:
     return ""
 
 
+_BEGINNINGS = frozenset({AuditAction.APPLY_BEGUN, AuditAction.ROLLBACK_BEGUN})
 _IN_PLACE = "{} has the new content, complete; the history lacks this write"
 
 

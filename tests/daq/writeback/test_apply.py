@@ -23,6 +23,7 @@ import pytest
 
 from daq.errors import CalibrationRefused, ControllerChanged, ControllerUnfit, OutputFailed
 from daq.ledger.audit import AuditAction, read
+from daq.ledger.ledger import record_write
 from daq.writeback.file_access import backups, exclusive_writer
 from daq.writeback.file_target import FileEdit, FileTarget
 from daq.writeback.request import Request
@@ -422,6 +423,33 @@ def test_a_write_that_was_killed_half_way_is_passed_over(controller: Path) -> No
     now = NOW + timedelta(hours=2)
     rollback(FileTarget(controller), now)
     assert controller.read_bytes() == original
+
+
+@pytest.mark.parametrize("has_refusal_since", [False, True])
+def test_a_rollback_says_that_the_last_write_was_never_made(
+    controller: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, has_refusal_since: bool
+) -> None:
+    audit = tmp_path / "audit.jsonl"
+    original = controller.read_bytes()
+    proposal = _propose(demo_calibration(), controller)
+    apply(proposal, NOW, audit=audit, who="anna")
+    rollback(FileTarget(controller), NOW, audit=audit, who="anna")
+    apply(_propose(demo_calibration(), controller), NOW, audit=audit, who="anna")
+    assert "never made" not in caplog.text
+    digests = {
+        "sha256_before": hashlib.sha256(controller.read_bytes()).hexdigest(),
+        "sha256_after": hashlib.sha256(b"never written").hexdigest(),
+    }
+    subject = str(controller.resolve())
+    killed = AuditAction.APPLY_BEGUN
+    record_write(audit, killed, at=NOW, who="bert", subject=subject, details=digests)
+    if has_refusal_since:
+        refused = AuditAction.REFUSED
+        record_write(audit, refused, at=NOW, who="bert", subject=subject, details={})
+    rollback(FileTarget(controller), NOW, audit=audit, who="bert")
+    assert controller.read_bytes() == original
+    said = f"the last write to {subject}, begun by bert at {NOW.isoformat()}, was never made"
+    assert said in caplog.text
 
 
 def test_a_backup_that_is_no_yaml_is_not_restored(controller: Path) -> None:
