@@ -252,7 +252,16 @@ class SetupRefused(NodeError):
 
 
 class StateRefused(NodeError):
-    """An NMT state (no statusword) or a CiA 402 state was not reached in time."""
+    """An NMT state (no statusword) or a CiA 402 state was not reached in time.
+
+    Args:
+        node: that did not reach it.
+        asked: the state.
+        found: its state.
+        statusword: that says so; None for an NMT state.
+        remedy: in place of the usual one.
+        reported: error that the node has reported (EMCY); empty without one.
+    """
 
     def __init__(
         self,
@@ -262,6 +271,7 @@ class StateRefused(NodeError):
         statusword: int | None = None,
         *,
         remedy: str | None = None,
+        reported: str = "",
     ) -> None:
         if statusword is None:
             evidence = f"its heartbeat still says {found}"
@@ -269,6 +279,8 @@ class StateRefused(NodeError):
         else:
             evidence = f"statusword {statusword:#06x} says {found}"
             usual_remedy = "check the power stage, the safety chain (STO) and the fault memory"
+        if reported:
+            evidence = f"{evidence} after {reported}"
         super().__init__(node, f"asked for {asked}, {evidence}; {remedy or usual_remedy}")
         self.asked = asked
         self.found = found
@@ -322,13 +334,23 @@ class SampleLost(DriverError):
         axes: indices of the axes without a complete answer.
         names: of these axes.
         silent_s: time since the last answer of any axis [s]; None where some axis still answers.
+        reported: error that each of these axes has reported before (EMCY); empty without one.
     """
 
     def __init__(
-        self, cycle: int, axes: tuple[int, ...], names: Sequence[str], silent_s: float | None = None
+        self,
+        cycle: int,
+        axes: tuple[int, ...],
+        names: Sequence[str],
+        silent_s: float | None = None,
+        reported: Sequence[str] = (),
     ) -> None:
         if silent_s is None:
             text = f"no answer from {', '.join(names)}"
+            for name, error in zip(names, reported, strict=False):
+                who = "it" if len(names) == 1 else name
+                if error:
+                    text = f"{text}; {who} had reported {error}"
         else:
             text = (
                 f"no axis answered within {silent_s:.3g} s; check the power of the cell and the bus"

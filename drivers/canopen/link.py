@@ -163,6 +163,8 @@ class Link:
         self.policy = policy
         self.nmt: dict[int, int] = {}  #: Last NMT state of each node that sent a heartbeat
         self.heard_ns: dict[int, int] = {}  #: Time of that heartbeat by the clock
+        #: Last error of each node that has reported one since the bus was opened, and not its end
+        self.reported: dict[int, str] = {}
         self.answered: Counter[int] = Counter()  #: SDO answers of each node
         #: Boot-up messages of each node id right after another
         self.boots: Counter[int] = Counter()
@@ -343,14 +345,7 @@ class Link:
         if service == HEARTBEAT and message.data:
             self._note_heartbeat(node_id, message)
         elif service == EMCY and len(message.data) == 8:
-            code, register, data = struct.unpack("<HB5s", message.data)
-            # CiA 301: codes 00xxh report the end of an error.
-            kind = EventKind.EMCY if code & 0xFF00 else EventKind.EMCY_RESET
-            text = (
-                f"EMCY {code:04X}h {describe_error_code(code)}, error register {register:02X}h, "
-                f"data {data.hex()}"
-            )
-            self._events.append((node_id, kind, code, text))
+            self._note_error(node_id, message)
         elif service == SDO_ANSWER:
             self.answered[node_id] += 1
             for listener in self._listeners.get(node_id, ()):
@@ -358,6 +353,20 @@ class Link:
         else:
             return False
         return True
+
+    def _note_error(self, node_id: int, message: can.Message) -> None:
+        """Report an EMCY, the end of an error too, and keep the last error of each node."""
+        code, register, data = struct.unpack("<HB5s", message.data)
+        error = f"EMCY {code:04X}h {describe_error_code(code)}"
+        # CiA 301: codes 00xxh report the end of an error.
+        if code & 0xFF00:
+            kind = EventKind.EMCY
+            self.reported[node_id] = error
+        else:
+            kind = EventKind.EMCY_RESET
+            self.reported.pop(node_id, None)
+        text = f"{error}, error register {register:02X}h, data {data.hex()}"
+        self._events.append((node_id, kind, code, text))
 
     def _note_error_frame(self, message: can.Message) -> None:
         """Report the state of the CAN controller; the kernel sends each change once."""
@@ -527,4 +536,9 @@ class Link:
 
         if not self.wait(within_s, lambda: found() == state):
             shown = f"{nmt_name(found())} after {within_s:.3g} s"
-            raise StateRefused(self.objects(node_id), f"NMT {state}", shown)
+            raise StateRefused(
+                self.objects(node_id),
+                f"NMT {state}",
+                shown,
+                reported=self.reported.get(node_id, ""),
+            )

@@ -229,8 +229,13 @@ class _Execution:
 
     def _refusal(self, axis: int) -> StateRefused:
         word = self._sample.statusword[axis]
+        node = self._nodes[axis]
         return StateRefused(
-            self._nodes[axis], str(State.OPERATION_ENABLED), str(decode(word)), word
+            node,
+            str(State.OPERATION_ENABLED),
+            str(decode(word)),
+            word,
+            reported=self._network.link.reported.get(node.node_id, ""),
         )
 
     def move(self, number: int, move: Move) -> Iterator[Sample]:

@@ -323,7 +323,11 @@ class SyncStream:
             by_clock_ns = self.bus.clock() - self.bus.answered_ns
             by_cycles_ns = self._silent_cycles * self.pacing.period_ns
             silent_s = max(by_clock_ns, by_cycles_ns) * 1e-9
-        self.bus.faults.append(SampleLost(cycle, absent, names, silent_s))
+        reported: list[str] = []
+        for axis in absent:
+            node_id = self.network.axes[axis].node_id
+            reported.append(self._link.reported.get(node_id, ""))
+        self.bus.faults.append(SampleLost(cycle, absent, names, silent_s, reported))
 
     def _note_losses(self) -> None:
         """Report frames that this machine lost; their content is unknown."""

@@ -154,6 +154,12 @@ def test_a_lost_sample_names_the_silent_axes_or_says_that_none_answers() -> None
     assert str(error) == "cycle 12: no answer from J2, J3"
     assert error.cycle == 12
     assert error.axes == (1, 2)
+    error = SampleLost(12, (1, 2), ("J2", "J3"), None, ("", "EMCY 8130h life guard error"))
+    assert str(error) == (
+        "cycle 12: no answer from J2, J3; J3 had reported EMCY 8130h life guard error"
+    )
+    error = SampleLost(12, (2,), ("J3",), None, ("EMCY 8130h life guard error",))
+    assert str(error) == "cycle 12: no answer from J3; it had reported EMCY 8130h life guard error"
     silent = SampleLost(12, (0, 1, 2), ("J1", "J2", "J3"), 0.12345)
     assert str(silent).startswith("cycle 12: no axis answered within 0.123 s; check the power")
 

@@ -205,6 +205,8 @@ def _drive(network: CanopenNetwork, outcome: Outcome) -> None:
         )
         try:
             first = next(stream)
+            while first.missing:
+                first = next(stream)
             network.check_feedback(first)
             start = first.position_counts
             there = synchronised_move(

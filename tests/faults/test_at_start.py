@@ -8,8 +8,10 @@ import pytest
 
 from drivers.errors import (
     BusBusy,
+    DriveFault,
     DriverError,
     NodeMissing,
+    SampleLost,
     SetupRefused,
     StateRefused,
 )
@@ -65,6 +67,27 @@ def test_a_fault_from_the_start_is_refused_by_name_before_anything_moves(kind: F
     assert set(outcome.states) == {PowerState.SWITCH_ON_DISABLED}
     assert not outcome.cycles_of(EventKind.MOVE_START)
     assert outcome.restored
+
+
+@pytest.mark.parametrize("at_cycle", [0, 1, 2])
+def test_an_error_that_an_axis_reports_before_it_has_power_is_in_the_message(at_cycle: int) -> None:
+    fault = FaultSpec(FaultKind.EMERGENCY, 2, at_cycle, None, 0x4310)
+    outcome = run(f"overheated {at_cycle}", fault)
+    assert isinstance(outcome.error, (StateRefused, DriveFault)), outcome.error
+    assert "J3 (node 3)" in str(outcome.error)
+    assert "EMCY 4310h drive temperature too high" in str(outcome.error)
+    assert not outcome.cycles_of(EventKind.MOVE_START)
+
+
+@pytest.mark.parametrize("at_cycle", [0, 1])
+def test_an_axis_that_falls_silent_with_the_first_sync_is_named_with_its_error(
+    at_cycle: int,
+) -> None:
+    outcome = run(f"fell back {at_cycle}", FaultSpec(FaultKind.FALLS_BACK, 2, at_cycle))
+    assert isinstance(outcome.error, (SampleLost, DriveFault)), outcome.error
+    assert "J3 (node 3)" in str(outcome.error)
+    assert "EMCY 8130h life guard error or heartbeat error" in str(outcome.error)
+    assert not outcome.cycles_of(EventKind.MOVE_START)
 
 
 @pytest.mark.slow
