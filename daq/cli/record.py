@@ -255,9 +255,13 @@ def mounted(cell: Cell, name: str | None) -> Payload | None:
     known = {payload.name: payload.payload for payload in cell.payloads}
     if name is None or name in known:
         return None if name is None else known[name]
+    alike = [one for one in known if one.casefold() == name.casefold()]
+    remedy = "weigh it and add it to `payloads` of the cell file"
+    if alike:
+        remedy = f"write `--payload {alike[0]}`"
     raise UsageError(
         f"payload {name!r}",
         found="no such payload in the cell file",
         expected=", ".join(known) or "none: the cell declares no payloads",
-        remedy="weigh it and add it to `payloads` of the cell file",
+        remedy=remedy,
     )

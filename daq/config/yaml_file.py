@@ -48,6 +48,8 @@ MAX_BITS = 64  #: Longest integer: no object of an amplifier is longer
 MAX_EXPLAINED = 100
 MAX_SHOWN = 8  #: Faults listed in one message
 _NOT_IN_FILE = "\0"
+#: Characters that YAML 1.1 takes for the end of a line, and that editors show as nothing
+_HIDDEN_LINE_END = re.compile("[\u0085\u2028\u2029]")
 
 PATTERNS = {
     r"^[\w][\w .()/+-]*$": "letters, digits, spaces and _ . ( ) / + -, beginning with a letter, a "
@@ -262,11 +264,13 @@ def parse_yaml(text: bytes, name: str) -> Document:
             loader.dispose()
     except yaml.MarkedYAMLError as error:
         line = _line(error.problem_mark or error.context_mark)
+        found = (error.problem or error.context or "broken YAML").removeprefix("found ")
+        remedy = "mind indentation (spaces, no tabs), colons and quotes; is this the right file?"
+        if found == "but found another document":
+            found = "a second document, behind `---`"
+            remedy = "remove this line and what is below it, or give that a file of its own"
         raise YamlInvalid(
-            f"{name}:{line}",
-            found=(error.problem or error.context or "broken YAML").removeprefix("found "),
-            expected="one YAML document",
-            remedy="mind indentation (spaces, no tabs), colons and quotes; is this the right file?",
+            f"{name}:{line}", found=found, expected="one YAML document", remedy=remedy
         ) from error
     except (yaml.YAMLError, UnicodeDecodeError, ValueError, RecursionError) as error:
         kind = type(error).__name__
@@ -284,12 +288,13 @@ def _check_encoding(text: bytes, name: str) -> None:
     """Refuse bytes that are no UTF-8, with their line; libyaml has no place for them.
 
     Raises:
-        YamlInvalid: a byte is in another encoding. UTF-16 with its mark is left to libyaml.
+        YamlInvalid: a byte is in another encoding, or a line ends with a character that is not to
+            be seen. UTF-16 with its mark is left to libyaml.
     """
     if text.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return
     try:
-        text.decode("utf-8")
+        decoded = text.decode("utf-8")
     except UnicodeDecodeError as error:
         line = text.count(b"\n", 0, error.start) + 1
         raise YamlInvalid(
@@ -298,6 +303,15 @@ def _check_encoding(text: bytes, name: str) -> None:
             expected="one YAML document in UTF-8",
             remedy="save the file as UTF-8; is this the right file?",
         ) from error
+    hidden = _HIDDEN_LINE_END.search(decoded)
+    if hidden is not None:
+        line = decoded.count("\n", 0, hidden.start()) + 1
+        raise YamlInvalid(
+            f"{name}:{line}",
+            found=f"an invisible character that ends a line (U+{ord(hidden[0]):04X})",
+            expected="lines that end with a line feed",
+            remedy="remove it: it comes with text that was copied from a page or a document",
+        )
 
 
 def _check_events(text: bytes, name: str) -> None:

@@ -86,7 +86,9 @@ class JsonDocument(ControllerDocument):
             )
         except json.JSONDecodeError as error:
             raise self._no_json(_broken_place(error.doc, error.pos)) from error
-        except (ValueError, RecursionError) as error:
+        except RecursionError as error:
+            raise self._no_json("too many lists in lists") from error
+        except ValueError as error:
             raise self._no_json(str(error)) from error
         return dict(_walk((), tree))
 

@@ -176,7 +176,10 @@ def _composed(text: str, name: str, version: str) -> Any:
         else:
             root = yaml.compose(text, Loader=yaml.SafeLoader)
         found = "nothing in it"
-    except (YAMLError, yaml.YAMLError, ValueError, RecursionError) as error:
+    except RecursionError:
+        root = None
+        found = "too many lists in lists"
+    except (YAMLError, yaml.YAMLError, ValueError) as error:
         root = None
         found = " ".join(str(error).split())[:200]
     if root is None:

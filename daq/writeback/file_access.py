@@ -103,7 +103,7 @@ def require_existing(file: Path) -> None:
 
 @contextlib.contextmanager
 def exclusive_writer(target: Path) -> Iterator[None]:
-    """Exclude other writers of a file.
+    """Exclude other writers of a file, and remove the copies that killed ones have left.
 
     Raises:
         CalibrationRefused: another drivegain writes it.
@@ -129,7 +129,20 @@ def exclusive_writer(target: Path) -> Iterator[None]:
                 expected="a lock file next to the controller's file",
                 remedy="nothing was written to the controller; free space or rights",
             ) from error
+        _remove_unfinished(target)
         yield
+
+
+def _remove_unfinished(target: Path) -> None:
+    """Remove unfinished copies of a file and of its backups, as `replace_file` names them.
+
+    Whoever has the lock knows that no writer works on them.
+    """
+    name = re.compile(rf"\.{re.escape(target.name)}(\..*\.bak)?\.\d+-\d+\.tmp")
+    with contextlib.suppress(OSError):
+        for found in target.parent.iterdir():
+            if name.fullmatch(found.name):
+                found.unlink(missing_ok=True)
 
 
 @dataclass(frozen=True, slots=True)

@@ -158,7 +158,7 @@ def age(context: GateContext) -> Iterator[GateFinding]:
             found = f"an impossible date, {recording.recorded_s:g} s of Unix time"
             remedy = "fit the logs again"
         elif days > 0:
-            found = f"recorded {_span(days)} ago"
+            found = f"recorded {_span(days, longest)} ago"
             remedy = "record again and fit"
         else:
             found = f"recorded {_span(-days)} from now"
@@ -170,11 +170,16 @@ def age(context: GateContext) -> Iterator[GateFinding]:
         yield name, found, expected, remedy
 
 
-def _span(days: float) -> str:
-    """In hours where days would be a small fraction."""
-    if days >= 1.0:
-        return f"{round(days, 1):g} days"
-    return f"{24.0 * days:.2g} hours"
+def _span(days: float, limit_days: float = 0.0) -> str:
+    """A time in days, or in hours where days would be a small fraction;
+    with as many digits as show that it is beyond a limit.
+    """
+    if days < 1.0:
+        return f"{24.0 * days:.2g} hours"
+    rounded = round(days, 1)
+    if rounded > limit_days:
+        return f"{rounded:g} days"
+    return f"{format_at_limit(days, limit_days, 2)} days"
 
 
 def serials(context: GateContext) -> Iterator[GateFinding]:

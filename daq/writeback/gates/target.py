@@ -57,7 +57,15 @@ def uncertainty(context: GateContext) -> Iterator[GateFinding]:
 def same_sign(context: GateContext) -> Iterator[GateFinding]:
     """Require the sign of the current gain and of the nameplate."""
     for change in _finite_changes(context):
-        if not _keeps_sign(change):
+        if change.compared_gain == 0.0:
+            yield (
+                change.axis,
+                f"a {change.compared_with.value} of 0",
+                "a number that is not zero, with the sign of the new gain",
+                "look whether this is the number of the gain; if it is, enter the nameplate there "
+                "first",
+            )
+        elif not _keeps_sign(change):
             yield (
                 change.axis,
                 f"gain {change.new:g}, {_others_text(change)}",

@@ -144,7 +144,7 @@ def test_the_remedy_names_a_page_with_every_key(model: type[StrictModel], checko
         ("a: &x [1]\nb: *x\n", ":2", "alias"),
         ("a: !!python/name:os.system\n", ":1: a", "tag"),
         ("a: [1, 2\nb: 3\n", ":2", ""),
-        ("a: 1\n---\nb: 2\n", ":2", "another document"),
+        ("a: 1\n---\nb: 2\n", ":2", "a second document, behind `---`"),
         ("1: x\n", ":1", "key '1'"),
         ("? [a, b]\n: x\n", ":1", "a sequence as a key"),
         ("a:\n\tb: 1\n", ":2", ""),
@@ -162,6 +162,16 @@ def test_what_yaml_allows_and_a_configuration_must_not(text: str, line: str, fou
     assert found in str(caught.value)
     assert "found found" not in str(caught.value)
     assert "Node(" not in str(caught.value)
+
+
+@pytest.mark.parametrize("character", ["\u0085", "\u2028", "\u2029"])
+def test_a_character_that_ends_a_line_and_is_not_to_be_seen_is_named(character: str) -> None:
+    text = f"a: 1\nname: press{character}4\n"
+    with pytest.raises(YamlInvalid) as caught:
+        parse_yaml(text.encode(), "cell.yaml")
+    named = f"U+{ord(character):04X}"
+    assert "cell.yaml:2" in str(caught.value)
+    assert f"an invisible character that ends a line ({named})" in str(caught.value)
 
 
 def test_a_tab_before_a_comment_is_read() -> None:

@@ -165,6 +165,20 @@ def test_a_second_writer_is_refused(controller: Path) -> None:
     assert not lock.exists()
 
 
+def test_the_next_writer_removes_what_killed_ones_have_left_unfinished(controller: Path) -> None:
+    folder = controller.parent
+    left = [
+        folder / ".demo.yaml.4711-0.tmp",
+        folder / ".demo.yaml.20250102T030405Z.0123456789ab-ba9876543210.bak.4711-3.tmp",
+    ]
+    kept = [folder / ".other.yaml.4711-0.tmp", folder / "demo.yaml.tmp", folder / ".demo.yaml.tmp"]
+    for file in (*left, *kept):
+        file.write_text("half")
+    apply(_propose(demo_calibration(), controller), NOW)
+    assert not any(file.exists() for file in left)
+    assert all(file.exists() for file in kept)
+
+
 def test_the_lock_that_a_killed_writer_leaves_keeps_no_other_user_out(tmp_path: Path) -> None:
     file = tmp_path / "x.yaml"
     lock = tmp_path / ".x.yaml.lock"

@@ -942,6 +942,10 @@ def test_an_age_below_a_day_is_reported_in_hours(inputs: ProposalInputs) -> None
     assert [(one.found, one.expected) for one in days.propose().refusals] == [
         ("recorded 30.1 days ago", "recorded within the last 30 days")
     ]
+    recorded_s = (NOW - 30.002 * DAY).timestamp()
+    days = _source(0, recorded_s=recorded_s)(replace(inputs, policy=ApplyPolicy()))
+    (just_too_old,) = days.propose().refusals
+    assert just_too_old.found == "recorded 30.002 days ago"
 
 
 @pytest.mark.parametrize("days", [3, 730])
@@ -1034,7 +1038,8 @@ def test_a_zero_in_the_file_has_no_sign_to_keep(inputs: ProposalInputs) -> None:
     reviewed = replace(inputs, base=base)
     (refusal,) = reviewed.propose().refusals
     assert (refusal.gate, refusal.subject) == (Gate.SIGN, "J6")
-    assert refusal.found == "gain 6.79, current gain 0, nameplate 7.68"
+    assert refusal.found == "a current gain of 0"
+    assert "enter the nameplate there first" in refusal.remedy
 
 
 def test_an_effect_on_all_axes_is_called_so(inputs: ProposalInputs) -> None:
