@@ -49,16 +49,23 @@ RequestT = TypeVar("RequestT")
 
 def judged_output(path: Path | None) -> Path | None:
     """Refuse, as the command line is parsed, a place to write to that another user has chosen,
-    and a device or pipe.
+    a device or pipe, and the name `-`.
 
     The callback of every option (`output_option`) and argument that names a file or folder to
     write; it returns the path as it was given.
 
     Raises:
-        UsageError: as `judge_target`.
+        UsageError: as `judge_target`; or the name is `-`.
     """
     if path is None:
         return None
+    if str(path) == "-":
+        raise UsageError(
+            "-",
+            found="the name by which other programs mean standard output",
+            expected="the name of a file or folder",
+            remedy="give one; `--json` prints the result of most verbs",
+        )
     try:
         judge_target(path)
     except OSError as error:

@@ -215,6 +215,17 @@ def test_no_verb_writes_to_a_place_that_another_user_chose_nor_to_a_device(
     assert (after.st_ino, after.st_mode, st_size) == expected
 
 
+@pytest.mark.parametrize("line", [line for line in OUTPUTS if not line.endswith(" to")])
+def test_no_verb_writes_a_file_of_the_name_of_standard_output(
+    line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    code = main(["-" if word == "PIPE" else word for word in OUTPUTS[line]])
+    assert code == ExitCode.USAGE
+    assert "the name by which other programs mean standard output" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root may give a link away")
 def test_nothing_is_written_through_a_link_that_comes_later(tmp_path: Path) -> None:
     """Between the command line and the write, and in the folders that it names."""
