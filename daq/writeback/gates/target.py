@@ -229,8 +229,8 @@ def signature(context: GateContext) -> Iterator[GateFinding]:
     """Require signatures of others than the operator; `--by` must be a signer or the login.
 
     Names are compared without case and blanks, and however they are encoded (NFKC). The operator's
-    name must be a signer's, or the login: a look-alike of their own name would make two persons of
-    one.
+    name must be a signer's, or the login: otherwise a name that only looks like their own would
+    count as another person.
 
     Raises:
         ConfigurationInconsistent: a public key of the policy is none.
