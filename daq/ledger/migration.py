@@ -103,7 +103,7 @@ def read_stored(path: Path) -> StoredHistory:
 
 @contextlib.contextmanager
 def _translate_errors(path: Path) -> Iterator[None]:
-    """Raise the errors of `read_stored` for those of SQLite and of rows with other content."""
+    """Turn errors of SQLite, and of foreign rows, into those that `read_stored` documents."""
     try:
         yield
     except ValueError as error:

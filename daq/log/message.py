@@ -101,7 +101,7 @@ _ENCAPSULATION = b"\x00\x01\x00\x00"  #: CDR, little-endian
 _EVENT_HEAD = struct.Struct("<4siIh2x")
 #: An AxisReading: encapsulation, stamp, axis and value
 _READING = struct.Struct("<4siIh6xd")
-_NO_AXIS = -1  #: `axis` of an event of the cell
+_NO_AXIS = -1  #: Number in the place of an axis, in an event of the cell
 
 
 def sample_struct(axes: int) -> struct.Struct:
@@ -198,7 +198,8 @@ def event_from_bytes(data: bytes) -> CellEvent:
     encapsulation, seconds, nanoseconds, number = _EVENT_HEAD.unpack_from(data)
     _require_cdr(encapsulation)
     kind, kind_end = _read_string(data, _EVENT_HEAD.size)
-    code_start = kind_end + -kind_end % 4
+    padding = -kind_end % 4
+    code_start = kind_end + padding
     (code,) = struct.unpack_from("<I", data, code_start)
     text, _ = _read_string(data, code_start + 4)
     time_ns = _time_ns(seconds, nanoseconds)

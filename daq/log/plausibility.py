@@ -115,6 +115,7 @@ def signed_counts(
         is_positive = counts.min() >= 0.0
         is_unsigned = is_positive and LARGEST_RAW < counts.max() <= LARGEST_UNSIGNED
         if is_unsigned:
+            # Two's complement: the largest unsigned count is −1.
             is_negative = counts > LARGEST_RAW
             signed[is_negative, index] -= LARGEST_UNSIGNED + 1.0
             remarks.append(
