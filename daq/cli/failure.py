@@ -1,8 +1,8 @@
 """An error for the user: subject, found, expected and remedy, a line each, or a line of JSON.
 
-The errors of `daq` carry the four parts. Those of `drivers` and `ident` say what was found;
-`ADVICE` adds what the command line expects there, and a remedy, and `daq.advice` puts verbs in the
-place of functions. Errors of the operating system on a bus are explained by their number.
+The errors of `daq` have all four parts. Those of `drivers` and `ident` have the first two; `ADVICE`
+adds expected and remedy for the command line, and `daq.advice` replaces functions by verbs. Errors
+of the operating system on a bus are explained by their number.
 """
 
 from __future__ import annotations
@@ -136,8 +136,9 @@ ADVICE: dict[type[Exception], tuple[str, str]] = {
         "check the cell file and the logs (`drivegain info LOG`)",
     ),
 }
-"""Expected and remedy by class of error, the nearest class first,
-where the error has none of its own.
+"""Expected and remedy by class of error, for errors that have neither.
+
+The nearest base class of an error counts.
 """
 
 _CHECK_NODE = (
@@ -190,12 +191,15 @@ ADVICE_WITHIN: dict[str, dict[type[Exception], tuple[str, str]]] = {
         ),
     },
 }
-"""The same within a verb that `ADVICE` would propose to run: its user has just done so."""
+"""Expected and remedy within a verb, by class of error, instead of those of `ADVICE`.
 
-#: How a message about a fault may end
+`ADVICE` would propose the verb that the user has just run.
+"""
+
+#: End of a message about a fault, for users of the library
 RESET = "; then reset the fault with `CanopenNetwork.reset_faults`"
 
-_BY_NUMBER: dict[int, tuple[str, str, str]] = {
+_BUS_ADVICE: dict[int, tuple[str, str, str]] = {
     errno.ECONNREFUSED: (
         "nothing that listens there (connection refused)",
         "a CAN server, or a simulated cell",
@@ -232,12 +236,11 @@ _BY_NUMBER: dict[int, tuple[str, str, str]] = {
         "check `bus.host` in the cell file, the network cable and the firewall",
     ),
 }
-_BY_NUMBER |= {
-    errno.EPROTONOSUPPORT: _BY_NUMBER[errno.EAFNOSUPPORT],
-    errno.EACCES: _BY_NUMBER[errno.EPERM],
-    errno.EHOSTUNREACH: _BY_NUMBER[errno.ETIMEDOUT],
-    errno.ENETUNREACH: _BY_NUMBER[errno.ETIMEDOUT],
-}
+"""Found, expected and remedy of an error on a bus, by the operating system's number."""
+_BUS_ADVICE[errno.EPROTONOSUPPORT] = _BUS_ADVICE[errno.EAFNOSUPPORT]
+_BUS_ADVICE[errno.EACCES] = _BUS_ADVICE[errno.EPERM]
+_BUS_ADVICE[errno.EHOSTUNREACH] = _BUS_ADVICE[errno.ETIMEDOUT]
+_BUS_ADVICE[errno.ENETUNREACH] = _BUS_ADVICE[errno.ETIMEDOUT]
 
 
 @dataclass(frozen=True, slots=True)
@@ -245,52 +248,55 @@ class ErrorParts:
     """An error in its parts."""
 
     kind: str  #: class of the error
-    error: str  #: subject, or the whole message where that says what was found
+    error: str  #: subject, or the complete message if the message says what was found
     found: str
     expected: str
-    do: str
+    do: str  #: remedy
     exit_code: int
-    notes: dict[str, str] = field(default_factory=dict)  #: by label: kept, hint
-    #: parts of the stop and of the restoring that could not be confirmed
+    notes: dict[str, str] = field(default_factory=dict)  #: by label, see `NOTES`
+    #: parts of the stop, and of the restoring of settings, that could not be confirmed
     unconfirmed: tuple[str, ...] = ()
-    powered: str = ""  #: axes that had power and are not confirmed without it
+    #: axes that had power and are not confirmed without it; empty where there are none
+    powered: str = ""
 
     @classmethod
     def of(cls, error: Exception, verb: str = "") -> ErrorParts:
-        """Take an error of `daq`, `drivers` or `ident` apart; `verb` is the one that raised it."""
+        """Split an error of `daq`, `drivers` or `ident`; `verb` is the one that raised it."""
+        subject, found, expected, remedy = map(for_command_line, _parts(error, verb))
         kind = type(error)
-        labelled: dict[str, str] = {}
+        code = exit_code(kind) or ExitCode.UNEXPECTED
+        notes: dict[str, str] = {}
         for note in getattr(error, "__notes__", ()):
             label, _, text = note.partition(": ")
             if label in NOTES:
-                labelled[label] = text
-        of_stop = driver.stop_notes(error)
-        subject, found, expected, remedy = map(for_command_line, _parts(error, verb))
+                notes[label] = text
+        stop_notes = driver.stop_notes(error)
+        unconfirmed = tuple(note for note in stop_notes if note.startswith(driver.WHILE))
         return cls(
             kind=kind.__name__,
             error=subject,
             found=found,
             expected=expected,
             do=remedy,
-            exit_code=int(exit_code(kind) or ExitCode.UNEXPECTED),
-            notes=labelled,
-            unconfirmed=tuple(note for note in of_stop if note.startswith(driver.WHILE)),
+            exit_code=int(code),
+            notes=notes,
+            unconfirmed=unconfirmed,
             powered=may_have_power(error),
         )
 
     def document(self) -> ErrorReport:
         """Return the object of `--json`.
 
-        It is made unchecked: an error is reported whatever is in it, and bytes of file names that
-        are not UTF-8 stay.
+        Its types are not checked: an error with any content is reported, and bytes of file names
+        that are not UTF-8 stay.
         """
         from daq.report.document import ErrorReport
 
-        sometimes: dict[str, Any] = dict(self.notes)
+        optional_parts: dict[str, Any] = dict(self.notes)
         if self.powered:
-            sometimes["axes"] = NOT_STOPPED.format(self.powered)
+            optional_parts["axes"] = NOT_STOPPED.format(self.powered)
         if self.unconfirmed:
-            sometimes["unconfirmed"] = list(self.unconfirmed)
+            optional_parts["unconfirmed"] = list(self.unconfirmed)
         return ErrorReport.model_construct(
             error=self.error,
             found=self.found,
@@ -298,14 +304,15 @@ class ErrorParts:
             do=self.do,
             exit_code=self.exit_code,
             kind=self.kind,
-            **sometimes,
+            **optional_parts,
         )
 
     def lines(self) -> Iterator[tuple[str, str, str]]:
-        """Label, text and style of each line for a terminal."""
+        """Yield label, text and style of each line for a terminal."""
         yield "error", self.error, "bold red"
         evidence = {"found": self.found, "expected": self.expected, "do": self.do}
         for label, text in evidence.items():
+            # The first line may be the complete message: it is not repeated.
             if text != self.error:
                 yield label, text, "bold"
         for label, text in self.notes.items():
@@ -318,40 +325,50 @@ class ErrorParts:
 
 def may_have_power(error: BaseException | None) -> str:
     """Name the axes that had power and are not confirmed without it; empty where there are none."""
-    of_power = [note for note in driver.stop_notes(error) if note.startswith(driver.POWERED)]
-    return ", ".join(note.removeprefix(driver.POWERED) for note in of_power)
+    axes = []
+    for note in driver.stop_notes(error):
+        if note.startswith(driver.POWERED):
+            axes.append(note.removeprefix(driver.POWERED))
+    return ", ".join(axes)
 
 
 def _parts(error: Exception, verb: str) -> tuple[str, str, str, str]:
-    """Subject, found, expected and remedy."""
+    """Return subject, found, expected and remedy."""
     if isinstance(error, DaqError | WITH_EVIDENCE):
         return error.subject, error.found, error.expected, error.remedy
     if isinstance(error, driver.BusError):
-        known = _BY_NUMBER.get(_number(error) or 0)
-        if known is not None:
-            return f"bus {error.address}", *known
-    if isinstance(error, driver.MotionRefused) and error.remedy and verb != "demo":
-        return "motion is refused", error.found, error.expected, error.remedy
-    if isinstance(error, driver.SetupRefused) and error.remedy and verb != "demo":
-        # What the drive itself showed says more than the kind of the error.
-        return error.found, error.found, error.expected, error.remedy
+        number = _system_error_number(error)
+        if number in _BUS_ADVICE:
+            found, expected, remedy = _BUS_ADVICE[number]
+            return f"bus {error.address}", found, expected, remedy
+    # The simulated cell of `demo` has no file, wiring or drives that these remedies are about.
+    if verb != "demo":
+        if isinstance(error, driver.MotionRefused) and error.remedy:
+            return "motion is refused", error.found, error.expected, error.remedy
+        if isinstance(error, driver.SetupRefused) and error.remedy:
+            # The answer of the drive says more than the class of the error.
+            return error.found, error.found, error.expected, error.remedy
+    expected, remedy = _advice(type(error), verb)
+    message = str(error)
+    if verb == "demo":
+        message = message.replace(RESET, "")
+    return message, message, expected, remedy
+
+
+def _advice(kind: type[Exception], verb: str) -> tuple[str, str]:
+    """Return expected and remedy for a class of errors, empty where there is no advice."""
     if verb == "demo":
         known_advice = ADVICE_WITHIN["demo"]
     else:
         known_advice = ADVICE | ADVICE_WITHIN.get(verb, {})
-    advice = ("", "")
-    for kind in type(error).__mro__:  # the nearest class first
-        if kind in known_advice:
-            advice = known_advice[kind]
-            break
-    said = str(error)
-    if verb == "demo":
-        said = said.replace(RESET, "")
-    return said, said, *advice
+    for base in kind.__mro__:  # the nearest class first
+        if base in known_advice:
+            return known_advice[base]
+    return "", ""
 
 
-def _number(error: BaseException | None) -> int | None:
-    """Return the number of the operating system's error that an error came from."""
+def _system_error_number(error: BaseException | None) -> int | None:
+    """Return the number of the operating system's error that caused an error, None without one."""
     seen: set[int] = set()
     while error is not None and id(error) not in seen:
         seen.add(id(error))
@@ -361,25 +378,28 @@ def _number(error: BaseException | None) -> int | None:
     return None
 
 
-INDENT = 10  #: Columns of the labels of an error
+INDENT = 10  #: Width of the labels of an error [columns]
 
 
 def show_failure(failure: ErrorParts, *, json_wanted: bool) -> None:
-    """Print an error on stderr; where that takes nothing, the exit code alone says it."""
+    """Print an error on stderr; if stderr cannot be written, the exit code alone reports it."""
     console = Console(stderr=True, soft_wrap=True)
     with suppress(OSError, ValueError):  # a full disk, a reader that has gone, a closed stream
         if json_wanted:
-            # An error as text needs no types of documents.
+            # Imported only here: an error as text does not need the types of documents.
             from daq.report.document import json_tree
 
-            line = json.dumps(json_tree(failure.document()), ensure_ascii=False)
+            tree = json_tree(failure.document())
+            line = json.dumps(tree, ensure_ascii=False)
             console.file.write(spelled_bytes(line) + "\n")
             return
+        line_start = "\n" + INDENT * " "
         for label, text, style in failure.lines():
-            # Indented, a line end in the name of a file cannot make another line of an error.
             shown = printable(text)
             if console.is_terminal:
-                shown = break_lines(shown, max(console.width - INDENT, 1))
-            indented = shown.replace("\n", "\n" + INDENT * " ")
+                width = max(console.width - INDENT, 1)
+                shown = break_lines(shown, width)
+            # A line end in the name of a file must not look like another line of the error.
+            indented = shown.replace("\n", line_start)
             padded_label = f"{label}:".ljust(INDENT)
             console.print(Text(padded_label, style=style) + Text(indented))

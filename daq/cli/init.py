@@ -23,34 +23,64 @@ TEMPLATES = (
     ("imports/tx40.yaml", "imports/{name}.yaml"),
 )
 """Shipped files, and their names in the new folder."""
+REPLACEMENTS = (
+    ("../controllers/demo.yaml", "../controllers/{name}.yaml"),
+    ("../cells/tx40.yaml", "../cells/{name}.yaml"),
+    # The next three keep their length, so that the comments after them stay aligned.
+    ("interface: virtual  ", "interface: socketcan"),
+    ("channel: demo", "channel: can0"),
+    ("pacing: lockstep", "pacing: timed   "),
+    ("unit: Nm(motor, a priori)", "unit: A"),
+)
+"""Texts of a shipped file, and those of the new cell."""
+CELL_NAME = re.compile(r"\w[\w.-]*")
+_BUS_SECTION = re.compile(
+    r"^bus:\n.*?(?=^axes:)",
+    re.MULTILINE | re.DOTALL,
+)
+_SHIPPED_NAME = re.compile(
+    r"^(name|controller): (demo|tx40)$",
+    re.MULTILINE,
+)
+_FIRST_COMMENT = re.compile(r"\A(#.*\n)+")
 
 
 def make_cell_folder(folder: Path, *, simulated: bool = False) -> tuple[Path, ...]:
-    """Copy the templates into a new or empty folder, all of them or none; return the files."""
+    """Copy the templates into a new or empty folder, all of them or none; return the files.
+
+    Args:
+        folder: its name becomes the name of the cell.
+        simulated: whether the cell is on the bus of `drivegain simulate demo`.
+
+    Raises:
+        UsageError: the folder has no name of a cell, or there is something in it.
+        OutputFailed: the file system refuses.
+    """
     import yaml
 
-    texts = yaml.safe_load(
-        (shipped_configurations() / "templates" / "new-cell.yaml").read_text(encoding="utf-8")
-    )
+    texts_file = shipped_configurations() / "templates" / "new-cell.yaml"
+    texts = yaml.safe_load(texts_file.read_text(encoding="utf-8"))
     name = folder.resolve().name
-    if not re.fullmatch(r"\w[\w.-]*", name):
+    if not CELL_NAME.fullmatch(name):
         raise UsageError(
             str(folder),
             found=f"a folder called {name!r}",
             expected="a name of letters, digits, . _ -",
             remedy="rename it",
         )
-    with write_new_folder(folder) as whole:
-        written = tuple(
-            _copy(source, whole / target.format(name=name), name, texts)
-            for source, target in TEMPLATES
-        )
+    # The files get their place at the end of the block, when all of them are complete.
+    with write_new_folder(folder) as temporary:
+        written = []
+        for source, target in TEMPLATES:
+            relative_path = target.format(name=name)
+            _write_from_template(source, temporary / relative_path, name, texts)
+            written.append(folder / relative_path)
         if simulated:
-            cell = whole / "cells" / f"{name}.yaml"
+            cell = temporary / "cells" / f"{name}.yaml"
             text = cell.read_text(encoding="utf-8")
-            bus = re.compile(r"^bus:\n.*?(?=^axes:)", re.MULTILINE | re.DOTALL)
-            cell.write_text(bus.sub(texts["simulated_bus"], text), encoding="utf-8")
-    return tuple(folder / path.relative_to(whole) for path in written)
+            text = _BUS_SECTION.sub(texts["simulated_bus"], text)
+            cell.write_text(text, encoding="utf-8")
+    return tuple(written)
 
 
 def init(
@@ -79,27 +109,34 @@ def init(
     say_next("drivegain", "scan", cell)
 
 
-def _copy(source: str, path: Path, name: str, texts: dict[str, Any]) -> Path:
+def _write_from_template(
+    source: str,
+    path: Path,
+    name: str,
+    texts: dict[str, Any],
+) -> None:
+    """Copy a shipped file; of YAML, replace names, bus and comments of the demonstration.
+
+    Args:
+        source: the file, below the shipped configurations.
+        path: the copy.
+        name: of the new cell.
+        texts: comments and sections of a new cell, from `new-cell.yaml`.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     shutil.copyfile(shipped_configurations() / source, path)
-    if path.suffix == ".yaml":
-        text = path.read_text(encoding="utf-8")
-        text = re.sub(r"^(name|controller): (demo|tx40)$", rf"\1: {name}", text, flags=re.MULTILINE)
-        text = re.sub(
-            r"\A(#.*\n)+",
-            texts["heads"].get(Path(source).parent.name, r"\g<0>").format(name=name),
-            text,
-        )
-        for key in ("bus", "axes", "payloads"):
-            text = text.replace(f"\n{key}:\n", f"\n{texts[key]}")
-        text = text.replace("../controllers/demo.yaml", f"../controllers/{name}.yaml")
-        text = text.replace("../cells/tx40.yaml", f"../cells/{name}.yaml")
-        text = text.replace("interface: virtual  ", "interface: socketcan").replace(
-            "channel: demo", "channel: can0"
-        )
-        text = text.replace("pacing: lockstep", "pacing: timed   ").replace(
-            "unit: Nm(motor, a priori)", "unit: A"
-        )
-        text = text.replace("\nsync:\n  period_us: 1000\n", f"\n{texts['sync']}")
-        path.write_text(text, encoding="utf-8")
-    return path
+    if path.suffix != ".yaml":
+        return
+    text = path.read_text(encoding="utf-8")
+    text = _SHIPPED_NAME.sub(rf"\1: {name}", text)
+    folder = Path(source).parent.name
+    first_comment = texts["heads"].get(folder)
+    if first_comment is not None:
+        first_comment = first_comment.format(name=name)
+        text = _FIRST_COMMENT.sub(first_comment, text)
+    for key in ("bus", "axes", "payloads"):
+        text = text.replace(f"\n{key}:\n", f"\n{texts[key]}")
+    for old, new in REPLACEMENTS:
+        text = text.replace(old, new.format(name=name))
+    text = text.replace("\nsync:\n  period_us: 1000\n", f"\n{texts['sync']}")
+    path.write_text(text, encoding="utf-8")

@@ -168,7 +168,7 @@ def read_history(ledger: Ledger) -> History:
         HistoryUnreadable: there is a history of an earlier version that cannot be read.
     """
     stored = _read_stored(ledger)
-    verdict = verify(ledger.audit, stored.noted.union(noted_heads(ledger.audit)))
+    verdict = verify(ledger.audit, stored.audit_digests.union(noted_heads(ledger.audit)))
     if stored.flaws:
         raise stored_error(ledger, stored.flaws)
     history = fold(_with_stored(verdict.intact, stored, ledger.cell), ledger.cell)
@@ -217,7 +217,7 @@ def verify_ledger(ledger: Ledger, heads: Collection[str] = ()) -> Verification:
     """
     stored = _read_stored(ledger)
     noted = noted_heads(ledger.audit)
-    verdict = verify(ledger.audit, stored.noted.union(heads, noted))
+    verdict = verify(ledger.audit, stored.audit_digests.union(heads, noted))
     entries = _with_stored(verdict.intact, EMPTY if stored.flaws else stored, ledger.cell)
     history = fold(entries, ledger.cell)
     broken = stored.flaws + history.unreadable
@@ -500,7 +500,7 @@ def _take_over(ledger: Ledger, *, who: str, at: datetime, forced: bool = False) 
         if may_be_sound or not forced:
             raise
         flaws = (error.found,)
-    verdict = verify(ledger.audit, stored.noted.union(noted_heads(ledger.audit)))
+    verdict = verify(ledger.audit, stored.audit_digests.union(noted_heads(ledger.audit)))
     if not verdict.holds:
         raise audit_error(ledger.audit, verdict)
     flaws += stored.flaws

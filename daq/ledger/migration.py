@@ -1,9 +1,9 @@
-"""The SQLite file in which earlier versions kept the history:
-what only it has goes into the audit log, once.
+"""Migration of the history that earlier versions stored in an SQLite file:
+entries that only the file has are added to the audit log, once.
 
-Those versions wrote each calibration and each write to a controller twice. What the audit log has
-is right, whatever the file says of it; from a file that is broken nothing is taken over
-(docs/decisions/0036).
+Those versions recorded each calibration and each write to a controller twice, in the file and in
+the audit log. Where the two disagree, the audit log is right. From a broken file nothing is
+migrated (docs/decisions/0036).
 """
 
 from __future__ import annotations
@@ -33,36 +33,35 @@ from daq.ledger.fold import (
     zoned,
 )
 
-BUSY_S = 5.0  #: How long to wait for another process' transaction
+BUSY_S = 5.0  #: Longest time to wait for the transaction of another process
 APPLICATION_ID = 0x64726776  #: In the header of every history of earlier versions
-VERSION = 1  #: Of its tables; there was no other
+VERSION = 1  #: Version of its tables; there was no other
 
 
 @dataclass(frozen=True, slots=True)
 class StoredHistory:
     """Content of the file."""
 
-    #: oldest first; of no entry (0), and without figures
+    #: oldest first; their entry has the number 0, and they have no figures
     calibrations: tuple[EnteredCalibration, ...]
     events: tuple[Event, ...]  #: writes to controllers, oldest first
     acknowledgements: tuple[Acknowledgement, ...]  #: oldest first
-    flaws: tuple[str, ...]  #: what is broken in it, as sentences
+    flaws: tuple[str, ...]  #: damage of the file, as sentences
 
     @property
-    def noted(self) -> frozenset[str]:
+    def audit_digests(self) -> frozenset[str]:
         """SHA-256 of the entries that the audit log must have."""
-        digests = [event.audit for event in self.events] + [
-            noted.audit for noted in self.acknowledgements
-        ]
+        digests: list[str | None] = [event.audit for event in self.events]
+        digests += [acknowledgement.audit for acknowledgement in self.acknowledgements]
         return frozenset(digest for digest in digests if digest is not None)
 
 
-EMPTY = StoredHistory((), (), (), ())
+EMPTY = StoredHistory(calibrations=(), events=(), acknowledgements=(), flaws=())
 
 
 @dataclass(frozen=True, slots=True)
 class EntryDraft:
-    """An entry that the audit log is to get."""
+    """An entry to be added to the audit log."""
 
     action: AuditAction  #: its kind
     at: datetime  #: its time, with zone
@@ -72,7 +71,7 @@ class EntryDraft:
 
 
 def read_stored(path: Path) -> StoredHistory:
-    """Read a history of an earlier version, and check it by itself; nothing is changed.
+    """Read a history of an earlier version, and check its consistency; nothing is changed.
 
     Raises:
         HistoryInaccessible: it is locked for long, or its rights do not let it be read.
@@ -80,39 +79,40 @@ def read_stored(path: Path) -> StoredHistory:
     """
     # Not "ro", which could not undo the unfinished transaction of a killed writer; "rw" opens a
     # read-only file, too.
-    address = f"file:{quote(os.fsencode(path.absolute()))}?mode=rw"
+    quoted = quote(os.fsencode(path.absolute()))
+    address = f"file:{quoted}?mode=rw"
     with (
         _translate_errors(path),
         contextlib.closing(sqlite3.connect(address, uri=True, timeout=BUSY_S)) as connection,
     ):
-        (tables,) = connection.execute("SELECT count(*) FROM sqlite_schema").fetchone()
-        (application,) = connection.execute("PRAGMA application_id").fetchone()
-        if not tables and not application:  # its first writer was killed before it was done
-            return EMPTY
+        (table_count,) = connection.execute("SELECT count(*) FROM sqlite_schema").fetchone()
+        (application_id,) = connection.execute("PRAGMA application_id").fetchone()
+        if not table_count and not application_id:
+            return EMPTY  # its first writer was killed before it made the tables
         (version,) = connection.execute("PRAGMA user_version").fetchone()
-        if application != APPLICATION_ID or version != VERSION:
-            known = application == APPLICATION_ID
-            raise _unreadable(
-                path, f"a history of version {version}" if known else "a file of another program"
-            )
-        damaged = [
-            str(row[0]) for row in connection.execute("PRAGMA integrity_check") if row[0] != "ok"
-        ]
-        if damaged:  # rows of a broken file prove nothing
-            return StoredHistory((), (), (), tuple(damaged))
-        return _content(connection)
+        if application_id != APPLICATION_ID:
+            raise _unreadable(path, "a file of another program")
+        if version != VERSION:
+            raise _unreadable(path, f"a history of version {version}")
+        results = connection.execute("PRAGMA integrity_check")
+        damage = tuple(str(row[0]) for row in results if row[0] != "ok")
+        if damage:  # rows of a broken file prove nothing
+            return replace(EMPTY, flaws=damage)
+        return _read_rows(connection)
 
 
 @contextlib.contextmanager
 def _translate_errors(path: Path) -> Iterator[None]:
+    """Turn errors of SQLite, and of foreign rows, into those that `read_stored` documents."""
     try:
         yield
     except ValueError as error:
         raise _unreadable(path, f"a row that drivegain did not write: {error}") from error
     except sqlite3.Error as error:
         name = getattr(error, "sqlite_errorname", "") or type(error).__name__
-        # Without the bytes of a damaged row.
-        found = f"{str(error).partition(' with text ')[0]} ({name})"
+        # SQLite appends the bytes of a damaged row; they are left out.
+        message, _, _ = str(error).partition(" with text ")
+        found = f"{message} ({name})"
         if name.startswith(_INACCESSIBLE):
             raise HistoryInaccessible(
                 str(path),
@@ -133,10 +133,11 @@ _INACCESSIBLE = (
     "SQLITE_READONLY",
     "SQLITE_IOERR",
 )
-"""Errors of SQLite, by the begin of their names, that say nothing of what the file has."""
+"""Prefixes of the names of SQLite's errors after which the content of the file is unknown."""
 
 
 def _unreadable(path: Path, found: str) -> HistoryUnreadable:
+    """Return the error for a file that cannot be read."""
     return HistoryUnreadable(
         str(path),
         found=found,
@@ -146,45 +147,86 @@ def _unreadable(path: Path, found: str) -> HistoryUnreadable:
     )
 
 
-def _content(connection: sqlite3.Connection) -> StoredHistory:
-    """Read all rows; raises ValueError for one that drivegain did not write."""
-    rows = connection.execute(
-        "SELECT digest, entered, document FROM calibration ORDER BY created, digest"
-    )
-    calibrations = [
-        EnteredCalibration(0, str(row[0]), zoned(row[1]), zoned(row[1]), str(row[2]), None)
-        for row in rows
-    ]
-    events = []
-    query = "SELECT digest, deed, at, who, target, audit, sha256_after FROM event ORDER BY number"
-    for digest, deed, at, who, target, audit, after in connection.execute(query):
-        events.append(
-            Event(digest, WriteAction(deed), zoned(at), _raw(who), _raw(target), audit, after)
+def _read_rows(connection: sqlite3.Connection) -> StoredHistory:
+    """Read all tables.
+
+    Raises:
+        ValueError: drivegain did not write a row.
+    """
+    calibrations = tuple(_read_calibrations(connection))
+    events = tuple(_read_events(connection))
+    acknowledgements = tuple(_read_acknowledgements(connection))
+    flaws = tuple(_unreadable_documents(calibrations))
+    return StoredHistory(calibrations, events, acknowledgements, flaws)
+
+
+def _read_calibrations(connection: sqlite3.Connection) -> Iterator[EnteredCalibration]:
+    """Yield the calibrations of the file, oldest first."""
+    query = "SELECT digest, entered, document FROM calibration ORDER BY created, digest"
+    for digest, entered_text, document in connection.execute(query):
+        entered = zoned(entered_text)
+        yield EnteredCalibration(
+            number=0,
+            digest=str(digest),
+            at=entered,
+            entered=entered,
+            document=str(document),
+            figures=None,
         )
-    acknowledgements = []
+
+
+def _read_events(connection: sqlite3.Connection) -> Iterator[Event]:
+    """Yield the writes to controllers of the file, oldest first."""
+    query = "SELECT digest, deed, at, who, target, audit, sha256_after FROM event ORDER BY number"
+    for digest, deed, at, who, target, audit, sha256_after in connection.execute(query):
+        yield Event(
+            digest=digest,
+            action=WriteAction(deed),
+            at=zoned(at),
+            who=_with_surrogates(who),
+            target=_with_surrogates(target),
+            audit=audit,
+            sha256_after=sha256_after,
+        )
+
+
+def _read_acknowledgements(connection: sqlite3.Connection) -> Iterator[Acknowledgement]:
+    """Yield the acknowledged changes of the file, oldest first."""
     query = "SELECT axis, since, at, who, why, audit FROM acknowledgement ORDER BY number"
     for axis, since, at, who, why, audit in connection.execute(query):
-        acknowledgements.append(
-            Acknowledgement(axis, zoned(since), zoned(at), _raw(who), _raw(why), audit)
+        yield Acknowledgement(
+            axis=axis,
+            since=zoned(since),
+            at=zoned(at),
+            who=_with_surrogates(who),
+            why=_with_surrogates(why),
+            audit=audit,
         )
-    flaws = tuple(_unreadable_documents(calibrations))
-    return StoredHistory(tuple(calibrations), tuple(events), tuple(acknowledgements), flaws)
 
 
-def _raw(text: str) -> str:
-    """Turn bytes of a name that are not UTF-8, which SQLite refuses,
-    into what they are in the audit log.
+def _with_surrogates(text: str) -> str:
+    r"""Replace escapes such as `\udcff` by lone surrogates.
+
+    A name may have bytes that are not UTF-8. In the audit log they are lone surrogates; SQLite
+    refuses those, so the file has them as escapes.
     """
-    return re.sub(r"\\u(d[89a-f][0-9a-f]{2})", lambda found: chr(int(found[1], 16)), text)
+    return re.sub(r"\\u(d[89a-f][0-9a-f]{2})", _surrogate, text)
+
+
+def _surrogate(escape: re.Match[str]) -> str:
+    """Return the character of an escape."""
+    hexadecimal = escape[1]
+    return chr(int(hexadecimal, 16))
 
 
 def _unreadable_documents(calibrations: Iterable[EnteredCalibration]) -> Iterator[str]:
-    for one in calibrations:
+    """Yield a sentence for each calibration with a document that cannot be read."""
+    for calibration in calibrations:
         try:
-            figures_of_document(one)
+            figures_of_document(calibration)
         except DaqError as error:
             yield (
-                f"calibration {one.digest[:12]}…: its document is {error.found}, expected "
+                f"calibration {calibration.digest[:12]}…: its document is {error.found}, expected "
                 f"{error.expected}"
             )
 
@@ -192,10 +234,11 @@ def _unreadable_documents(calibrations: Iterable[EnteredCalibration]) -> Iterato
 def drafts_of(
     stored: StoredHistory, entries: Sequence[AuditEntry], cell: str, who: str, at: datetime
 ) -> list[EntryDraft]:
-    """Return what the audit log lacks of a stored history: nothing where it was migrated before.
+    """Return the entries of a stored history that the audit log lacks;
+    none where the history was migrated before.
 
     Args:
-        stored: without flaws.
+        stored: history without flaws.
         entries: of the audit log.
         cell: name of the cell.
         who: the person or the job that migrates.
@@ -215,51 +258,62 @@ def _calibration_drafts(
     who: str,
     at: datetime,
 ) -> Iterator[EntryDraft]:
-    """Enter calibrations that only the file has, and the figures of those that an earlier version
-    entered.
+    """Yield entries for two kinds of calibrations: those of the audit log without figures, which an
+    earlier version entered, and those that only the file has.
     """
-    known = {one.digest: one for one in entered_calibrations(entries, cell)}
-    lacking = [one for one in stored if one.digest not in known]
-    without_figures = [
-        one for one in known.values() if one.figures is None and one.document is not None
-    ]
-    for one in (*without_figures, *lacking):
+    known = {}
+    for calibration in entered_calibrations(entries, cell):
+        known[calibration.digest] = calibration
+    without_figures = []
+    for calibration in known.values():
+        if calibration.figures is None and calibration.document is not None:
+            without_figures.append(calibration)
+    lacking = [calibration for calibration in stored if calibration.digest not in known]
+    for calibration in (*without_figures, *lacking):
         try:
-            figures = figures_of_document(one)
+            figures = figures_of_document(calibration)
         except DaqError:
-            continue  # reported wherever the history is read
+            continue  # every verb that reads the history reports it
         details: dict[str, object] = {
-            "sha256": one.digest,
+            "sha256": calibration.digest,
             "cell": cell,
-            "entered": iso(one.entered),
+            "entered": iso(calibration.entered),
             "figures": figures,
         }
-        if one.digest not in known:
-            details["document"] = one.document
-        yield EntryDraft(AuditAction.CALIBRATION_ENTERED, at, who, history_subject(cell), details)
+        if calibration.digest not in known:
+            details["document"] = calibration.document
+        subject = history_subject(cell)
+        yield EntryDraft(AuditAction.CALIBRATION_ENTERED, at, who, subject, details)
 
 
 def history_subject(cell: str) -> str:
-    """Return what the entries about calibrations have as their subject."""
+    """Return the subject of entries about the calibrations of a cell."""
     return f"history of {cell}"
 
 
 def _event_drafts(
     stored: Iterable[Event], entries: Sequence[AuditEntry], cell: str
 ) -> Iterator[EntryDraft]:
-    by_digest = {one.sha256: one for one in entries}
-    found = {
-        (one.subject, one.at, one.who) for one in entries if one.action is AuditAction.WRITE_FOUND
-    }
+    """Yield entries for writes without an end in the audit log."""
+    entry_by_digest = {entry.sha256: entry for entry in entries}
+    known_writes = set()
+    for entry in entries:
+        if entry.action is AuditAction.WRITE_FOUND:
+            known_writes.add((entry.subject, entry.at, entry.who))
     for event in stored:
-        named = by_digest.get(event.audit or "")
+        # The entry that the file names: the end of the write, or its begin if no end was written.
+        named = entry_by_digest.get(event.audit or "")
         if named is not None and is_end(named):
             continue
-        if (event.target, event.at.isoformat(), event.who) in found:
+        key = (event.target, event.at.isoformat(), event.who)
+        if key in known_writes:
             continue
+        begun = None
+        if named is not None:
+            begun = named.number
         details = {
             "action": event.action.value,
-            "begun": None if named is None else named.number,
+            "begun": begun,
             "calibration": {"sha256": event.digest, "cell": cell},
             "sha256_after": event.sha256_after,
             "migrated": True,
@@ -270,23 +324,33 @@ def _event_drafts(
 def _acknowledgement_drafts(
     stored: Iterable[Acknowledgement], entries: Sequence[AuditEntry], cell: str
 ) -> Iterator[EntryDraft]:
+    """Yield entries for acknowledgements that the audit log does not have for this cell.
+
+    It may have one without the cell's name, which the first versions did not enter.
+    """
     entered = list(acknowledgements_of(entries, cell))
-    named = {one.audit for one in entered}
-    # Migrated before, under an entry of its own
-    known = {replace(one, audit="") for one in entered}
-    for noted in stored:
-        # The first versions did not enter the name of the cell.
-        if noted.audit not in named and replace(noted, audit="") not in known:
-            details = {
-                "axis": noted.axis,
-                "cell": cell,
-                "since": noted.since.isoformat(),
-                "why": noted.why,
-                "migrated": True,
-            }
-            yield EntryDraft(
-                AuditAction.ACKNOWLEDGED, noted.at, noted.who, f"gain of {noted.axis}", details
-            )
+    known_digests = {acknowledgement.audit for acknowledgement in entered}
+    # One that was migrated before has the digest of another entry, and is otherwise the same.
+    known_content = {replace(acknowledgement, audit="") for acknowledgement in entered}
+    for acknowledgement in stored:
+        if acknowledgement.audit in known_digests:
+            continue
+        if replace(acknowledgement, audit="") in known_content:
+            continue
+        details = {
+            "axis": acknowledgement.axis,
+            "cell": cell,
+            "since": acknowledgement.since.isoformat(),
+            "why": acknowledgement.why,
+            "migrated": True,
+        }
+        yield EntryDraft(
+            action=AuditAction.ACKNOWLEDGED,
+            at=acknowledgement.at,
+            who=acknowledgement.who,
+            subject=f"gain of {acknowledgement.axis}",
+            details=details,
+        )
 
 
 def set_aside(path: Path, at: datetime) -> Path:
@@ -295,13 +359,14 @@ def set_aside(path: Path, at: datetime) -> Path:
     Raises:
         OSError: from the file system.
     """
-    aside = path.with_name(f"{path.name}.{at:%Y%m%dT%H%M%SZ}.bak")
+    name = f"{path.name}.{at:%Y%m%dT%H%M%SZ}"
+    renamed = path.with_name(f"{name}.bak")
     count = 0
-    while aside.exists():
+    while renamed.exists():
         count += 1
-        aside = path.with_name(f"{path.name}.{at:%Y%m%dT%H%M%SZ}-{count}.bak")
+        renamed = path.with_name(f"{name}-{count}.bak")
     journal = path.with_name(f"{path.name}-journal")
     with contextlib.suppress(FileNotFoundError):
-        journal.rename(aside.with_name(f"{aside.name}-journal"))
-    path.rename(aside)
-    return aside
+        journal.rename(renamed.with_name(f"{renamed.name}-journal"))
+    path.rename(renamed)
+    return renamed

@@ -1,9 +1,11 @@
 """The messages of a log: their ROS 2 definitions and their CDR bytes.
 
-CDR (OMG DDSI-RTPS, XCDR1): four bytes of encapsulation, then the fields in order, each aligned to
-its own size, counted from the end of the encapsulation. A sequence is its length and its elements; a
-string ends with NUL, which counts. With a given number of axes an AxisSamples message has a
-constant size, so numpy reads a chunk of them at once.
+CDR (OMG DDSI-RTPS, XCDR1) is four bytes of encapsulation, then the fields in order. Each field is
+aligned to its own size, counted from the end of the encapsulation. A sequence is its length and its
+elements. A string ends with NUL, which its length includes.
+
+With a given number of axes an AxisSamples message has a constant size, so numpy reads a chunk of
+them at once.
 """
 
 from __future__ import annotations
@@ -33,6 +35,7 @@ READING_TOPICS = {Quantity.TORQUE: "/cell/torque", Quantity.TEMPERATURE: "/cell/
 READING_SCHEMA = "drivegain_msgs/msg/AxisReading"
 RawArray = NDArray[np.int32]  #: Counts and currents as amplifiers send them
 LARGEST_AXES = 32  #: Number of bits in `missing`
+_NS_PER_S = 1_000_000_000
 
 _SEPARATOR = "=" * 80 + "\n"
 _TIME = _SEPARATOR + "MSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n"
@@ -93,29 +96,39 @@ SCHEMA_OF = {
 }
 """Schema name of every topic of a log."""
 
-_ENCAPSULATION = b"\x00\x01\x00\x00"  # CDR, little-endian
-_EVENT = struct.Struct("<4siIh2x")
+_ENCAPSULATION = b"\x00\x01\x00\x00"  #: CDR, little-endian
+#: Encapsulation, stamp and axis of a CellEvent, up to its `kind`
+_EVENT_HEAD = struct.Struct("<4siIh2x")
+#: An AxisReading: encapsulation, stamp, axis and value
 _READING = struct.Struct("<4siIh6xd")
-WHOLE_CELL = -1
+_NO_AXIS = -1  #: Number in the place of an axis, in an event of the cell
 
 
 def sample_struct(axes: int) -> struct.Struct:
     """Return the layout of an AxisSamples message, encapsulation first."""
-    padding = "2x" if axes % 2 else ""  # uint16[] of odd length leaves `missing` unaligned
+    padding = ""
+    if axes % 2:
+        padding = "2x"  # uint16[] of odd length leaves `missing` unaligned
     return struct.Struct(f"<4sQiII{axes}iI{axes}iI{axes}H{padding}I")
 
 
 def sample_bytes(layout: struct.Struct, sample: Sample) -> bytes:
     """Encode one sample.
 
+    Args:
+        layout: of `sample_struct`, for the number of axes.
+        sample: to be encoded.
+
     Raises:
         struct.error: a value does not fit its type, or the number of axes the layout.
     """
     axes = len(sample.position_counts)
+    seconds, nanoseconds = divmod(sample.time_ns, _NS_PER_S)
     return layout.pack(
         _ENCAPSULATION,
         sample.cycle,
-        *divmod(sample.time_ns, 1_000_000_000),
+        seconds,
+        nanoseconds,
         axes,
         *sample.position_counts,
         axes,
@@ -130,6 +143,8 @@ def sample_bytes(layout: struct.Struct, sample: Sample) -> bytes:
 def sample_dtype(axes: int) -> np.dtype[np.void]:
     """Return the numpy type of an MCAP record (opcode, length, 22 bytes of header)
     with an AxisSamples message.
+
+    `positions`, `currents` and `statuswords` are the lengths of the arrays after them.
     """
     fields: list[tuple[str, str] | tuple[str, str, tuple[int]]] = [
         ("opcode", "u1"),
@@ -156,15 +171,22 @@ def sample_dtype(axes: int) -> np.dtype[np.void]:
 
 
 ENCAPSULATION_WORD = int.from_bytes(_ENCAPSULATION, "little")
+"""The field `encapsulation` of `sample_dtype`."""
 
 
 def event_bytes(event: CellEvent) -> bytes:
     """Encode one event."""
-    axis = WHOLE_CELL if event.axis is None else event.axis
-    head = _EVENT.pack(_ENCAPSULATION, *divmod(event.time_ns, 1_000_000_000), axis)
-    kind = _string(event.kind.value)
+    seconds, nanoseconds = divmod(event.time_ns, _NS_PER_S)
+    axis = event.axis
+    if axis is None:
+        axis = _NO_AXIS
+    head = _EVENT_HEAD.pack(_ENCAPSULATION, seconds, nanoseconds, axis)
+    kind = _string_bytes(event.kind.value)
+    # The head ends at a multiple of 4, so the alignment counts from `kind`, too.
+    padding = _padding(kind, 4)
     code = struct.pack("<I", event.code)
-    return head + kind + _padding(kind, 4) + code + _string(event.text)
+    text = _string_bytes(event.text)
+    return head + kind + padding + code + text
 
 
 def event_from_bytes(data: bytes) -> CellEvent:
@@ -173,22 +195,24 @@ def event_from_bytes(data: bytes) -> CellEvent:
     Raises:
         ValueError, struct.error: the bytes are not a CellEvent of this software.
     """
-    head, seconds, nanoseconds, axis = _EVENT.unpack_from(data)
-    if head != _ENCAPSULATION:
-        raise ValueError(f"encapsulation {head!r}, expected little-endian CDR")
-    kind, end = _string_from(data, _EVENT.size)
-    end += -end % 4
-    (code,) = struct.unpack_from("<I", data, end)
-    text, _ = _string_from(data, end + 4)
+    encapsulation, seconds, nanoseconds, number = _EVENT_HEAD.unpack_from(data)
+    _require_cdr(encapsulation)
+    kind, kind_end = _read_string(data, _EVENT_HEAD.size)
+    padding = -kind_end % 4
+    code_start = kind_end + padding
+    (code,) = struct.unpack_from("<I", data, code_start)
+    text, _ = _read_string(data, code_start + 4)
     time_ns = _time_ns(seconds, nanoseconds)
-    return CellEvent(time_ns, None if axis == WHOLE_CELL else axis, EventKind(kind), code, text)
+    axis = number
+    if number == _NO_AXIS:
+        axis = None
+    return CellEvent(time_ns, axis, EventKind(kind), code, text)
 
 
 def reading_bytes(reading: SlowReading) -> bytes:
     """Encode one slow reading; the topic names its quantity."""
-    return _READING.pack(
-        _ENCAPSULATION, *divmod(reading.time_ns, 1_000_000_000), reading.axis, reading.value
-    )
+    seconds, nanoseconds = divmod(reading.time_ns, _NS_PER_S)
+    return _READING.pack(_ENCAPSULATION, seconds, nanoseconds, reading.axis, reading.value)
 
 
 def reading_from_bytes(data: bytes, quantity: Quantity) -> SlowReading:
@@ -197,57 +221,74 @@ def reading_from_bytes(data: bytes, quantity: Quantity) -> SlowReading:
     Raises:
         ValueError, struct.error: the bytes are not an AxisReading of this software.
     """
-    head, seconds, nanoseconds, axis, value = _READING.unpack(data)
-    if head != _ENCAPSULATION:
-        raise ValueError(f"encapsulation {head!r}, expected little-endian CDR")
+    encapsulation, seconds, nanoseconds, axis, value = _READING.unpack(data)
+    _require_cdr(encapsulation)
     time_ns = _time_ns(seconds, nanoseconds)
-    if not 0 <= axis < LARGEST_AXES or not math.isfinite(value):
+    is_axis = 0 <= axis < LARGEST_AXES
+    if not is_axis or not math.isfinite(value):
         raise ValueError(f"a value of {value} for axis {axis}")
     return SlowReading(time_ns, axis, quantity, value)
 
 
+def _require_cdr(encapsulation: bytes) -> None:
+    """Refuse a message in another encoding: its bytes have another order."""
+    if encapsulation != _ENCAPSULATION:
+        raise ValueError(f"encapsulation {encapsulation!r}, expected little-endian CDR")
+
+
 def _time_ns(seconds: int, nanoseconds: int) -> int:
-    if seconds < 0 or nanoseconds >= 1_000_000_000:
+    """Return the time of a stamp [ns since 1970]; raises ValueError for one that is none."""
+    if seconds < 0 or nanoseconds >= _NS_PER_S:
         raise ValueError(f"time {seconds} s, {nanoseconds} ns")
-    return seconds * 1_000_000_000 + nanoseconds
+    return seconds * _NS_PER_S + nanoseconds
 
 
 def _padding(data: bytes | bytearray, alignment: int) -> bytes:
-    """Return the zeros that lead to the next multiple of so many bytes."""
-    return b"\0" * (-len(data) % alignment)
+    """Return zeros from the end of the data to the next multiple of `alignment` bytes."""
+    count = -len(data) % alignment
+    return b"\0" * count
 
 
 def _length_bytes(values: Sized) -> bytes:
+    """Encode the length of a sequence."""
     return struct.pack("<I", len(values))
 
 
-def _string(text: str) -> bytes:
+def _string_bytes(text: str) -> bytes:
+    """Encode a string: its length, its bytes in UTF-8, and NUL."""
+    without_nul = text.replace("\0", " ")
     # Bytes of a file name that are no UTF-8 are in its text as lone surrogates; an error may name
     # such a file.
-    without_nul = text.replace("\0", " ")
-    data = without_nul.encode("utf-8", "backslashreplace") + b"\0"
+    encoded = without_nul.encode("utf-8", "backslashreplace")
+    data = encoded + b"\0"
     return _length_bytes(data) + data
 
 
-def _string_from(data: bytes, start: int) -> tuple[str, int]:
-    """Decode a string; return it with the position after it."""
+def _read_string(data: bytes, start: int) -> tuple[str, int]:
+    """Decode the string at a position; return it with the position after it."""
     (length,) = struct.unpack_from("<I", data, start)
-    end = start + 4 + length
-    text = data[start + 4 : end]
-    if len(text) != length or text[-1:] != b"\0":
+    text_start = start + 4
+    end = text_start + length
+    encoded = data[text_start:end]
+    if len(encoded) != length or encoded[-1:] != b"\0":
         raise ValueError(f"a string of {length} bytes that does not end")
-    return text[:-1].decode("utf-8"), end
+    text = encoded[:-1].decode("utf-8")
+    return text, end
 
 
 def joint_state_prefix(names: Sequence[str]) -> bytes:
-    """Encode the fields of a JointState between its stamp and its positions:
-    they are the same for every message.
+    """Encode the fields of a JointState between its stamp and its positions.
+
+    They are the same in every message.
     """
-    # The stamp before them is 8 bytes long, so alignment counts from here too.
-    data = bytearray(_string(""))  # frame_id
-    data += _padding(data, 4) + _length_bytes(names)
+    # The stamp before them has 8 bytes, so the alignment may be counted from here.
+    frame_id = _string_bytes("")
+    data = bytearray(frame_id)
+    data += _padding(data, 4)
+    data += _length_bytes(names)
     for name in names:
-        data += _padding(data, 4) + _string(name)
+        data += _padding(data, 4)
+        data += _string_bytes(name)
     return bytes(data)
 
 
@@ -264,7 +305,7 @@ def joint_state_bytes(
         prefix: of `joint_state_prefix`.
         time_ns: stamp [ns since 1970].
         position: [rad; m of a prismatic joint], shape (n,).
-        velocity: per second, shape (n,).
+        velocity: [rad/s; m/s of a prismatic joint], shape (n,).
         effort: [Nm; N of a prismatic joint], shape (n,) or empty.
     """
     return _doubles_bytes(time_ns, prefix, position, velocity, effort)
@@ -277,18 +318,25 @@ def currents_bytes(time_ns: int, current_a: Sequence[float]) -> bytes:
 
 def text_bytes(text: str) -> bytes:
     """Encode a String."""
-    return _ENCAPSULATION + _string(text)
+    return _ENCAPSULATION + _string_bytes(text)
 
 
 def _doubles_bytes(time_ns: int, prefix: bytes, *sequences: Sequence[float]) -> bytes:
-    """Encode a stamp, other fields and sequences of float64, aligned;
-    an empty one has no element to be aligned.
+    """Encode a message of a stamp, other fields and sequences of float64.
+
+    Args:
+        time_ns: stamp [ns since 1970].
+        prefix: the other fields, encoded.
+        sequences: after them, in order.
     """
-    stamp = struct.pack("<iI", *divmod(time_ns, 1_000_000_000))
+    seconds, nanoseconds = divmod(time_ns, _NS_PER_S)
+    stamp = struct.pack("<iI", seconds, nanoseconds)
     data = bytearray(stamp + prefix)
     for values in sequences:
-        data += _padding(data, 4) + _length_bytes(values)
+        data += _padding(data, 4)
+        data += _length_bytes(values)
+        # An empty sequence has no element that would have to be aligned.
         if len(values):
-            doubles = struct.pack(f"<{len(values)}d", *values)
-            data += _padding(data, 8) + doubles
+            data += _padding(data, 8)
+            data += struct.pack(f"<{len(values)}d", *values)
     return _ENCAPSULATION + bytes(data)

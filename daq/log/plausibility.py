@@ -1,8 +1,8 @@
 """Refuse numbers of a foreign recording that no robot moves by: a wrong unit, rate or column.
 
-Each check names the file, the column or axis, what was found, and the setting of the import
-description to correct. A step, a speed or a current is judged as in a recording of our own
-(`daq.log.impossible`), and so are readings that are none (`daq.log.column_faults`).
+Each check names the file, the column or axis, the number it found, and the setting of the import
+description to correct. Steps, speeds and currents are judged as in a recording by drivegain
+(`daq.log.impossible`), and so are faults of a channel (`daq.log.column_faults`).
 """
 
 from __future__ import annotations
@@ -36,35 +36,40 @@ from ident.errors import CurrentUnsigned
 from ident.plausible import TEMPERATURES_C
 
 _LOG = logging.getLogger("drivegain")
-LARGEST_RAW = 2**31 - 1
-LARGEST_UNSIGNED = 2**32 - 1
-#: Values of a column that is compared with others; a line at rest may be zero on two axes
+LARGEST_RAW = 2**31 - 1  #: Largest signed integer of 32 bits
+LARGEST_UNSIGNED = 2**32 - 1  #: Largest unsigned integer of 32 bits
+#: Fewest different values of a column that is compared with others: two axes at rest may both read
+#: zero
 FEWEST_DIFFERENT = 3
 SMALLEST_MOTION = 0.02  #: Smallest motion of at least one joint, as a share of its range
+#: Share of the velocity limits. If no joint is ever faster, the real rate may be ten times the
+#: declared one.
 SLOW_SHARE = 0.1
-"""Share of the velocity limits; if no joint is ever faster,
-the real rate may be ten times the declared one.
-"""
-LARGEST_NUMBER = 1e12  #: Of a position, speed, current or torque in any unit
-VELOCITY_WINDOW_S = 0.1  #: Time over which the ways by velocities and by positions are compared
-STILL = 1e-3  #: Difference of speed that is no contradiction, as a share of the velocity limit
+LARGEST_NUMBER = 1e12  #: Largest position, speed, current or torque, in any unit
+#: Time over which the displacements by velocities and by positions are compared
+VELOCITY_WINDOW_S = 0.1
+#: Difference of speed that is no contradiction, as a share of the velocity limit
+SPEED_TOLERANCE = 1e-3
+#: Least divisor of a ratio that only appears in a message
+SMALLEST_DIVISOR = 1e-300
 
 
 def check_sizes(wanted: ImportDescription, cell: Cell, files: dict[str, Table]) -> None:
-    """Refuse numbers that no robot has in any unit: the file is damaged, or a column is another."""
+    """Refuse numbers that no robot has in any unit: the file is damaged, or a column is wrong."""
     for key, section in wanted.sections():
         least = -LARGEST_NUMBER
         largest = LARGEST_NUMBER
-        values = section_values(section, files)
         if isinstance(section, TemperatureColumns):
             least, largest = TEMPERATURES_C
+        values = section_values(section, files)
         if isinstance(section, ScaledColumns):
+            factors = np.array(section.factors(cell.axis_names))
             with np.errstate(over="ignore"):
-                values = values * np.array(section.factors(cell.axis_names))
+                values = values * factors
         is_inside = (least <= values) & (values <= largest)
-        wrong = np.argwhere(~is_inside)
-        if wrong.size:
-            row, column = wrong[0].tolist()
+        outside = np.argwhere(~is_inside)
+        if outside.size:
+            row, column = outside[0].tolist()
             raise TableUnfit(
                 section_place(section, files, row, column),
                 found=f"{values[row, column]:g}, as {key}",
@@ -77,10 +82,10 @@ def check_sizes(wanted: ImportDescription, cell: Cell, files: dict[str, Table]) 
 def check_counts(
     position: FloatArray, wanted: ImportDescription, files: Mapping[str, Table]
 ) -> None:
-    """Refuse counts that are no whole numbers of 32 bits."""
-    is_broken = position != np.rint(position)
-    is_large = np.abs(position) > LARGEST_RAW
-    wrong = np.argwhere(is_broken | is_large)
+    """Refuse counts that are no signed integers of 32 bits."""
+    has_fraction = position != np.rint(position)
+    is_too_large = np.abs(position) > LARGEST_RAW
+    wrong = np.argwhere(has_fraction | is_too_large)
     if wrong.size:
         row, column = wrong[0].tolist()
         raise TableUnfit(
@@ -94,23 +99,25 @@ def check_counts(
 def signed_counts(
     position: FloatArray, wanted: ImportDescription
 ) -> tuple[FloatArray, tuple[str, ...]]:
-    """Return counts with a sign where a column has them of 32 bits without:
-    the same counter, read as a drive does.
+    """Convert columns of unsigned counts of 32 bits to signed ones, as a drive reads its counter.
 
     Args:
-        position: as the file has it, shape (rows, n).
+        position: counts of the file, shape (rows, n).
         wanted: with the columns of the positions.
 
     Returns:
-        position, shape (rows, n), and a remark for each column that was changed.
+        signed counts, shape (rows, n), and a remark for each column that was changed.
     """
     signed = position.copy()
     remarks = []
     for index, (_, column) in enumerate(wanted.position.places):
         counts = position[:, index]
         is_positive = counts.min() >= 0.0
-        if is_positive and LARGEST_RAW < counts.max() <= LARGEST_UNSIGNED:
-            signed[counts > LARGEST_RAW, index] -= LARGEST_UNSIGNED + 1.0
+        is_unsigned = is_positive and LARGEST_RAW < counts.max() <= LARGEST_UNSIGNED
+        if is_unsigned:
+            # Two's complement: the largest unsigned count is −1.
+            is_negative = counts > LARGEST_RAW
+            signed[is_negative, index] -= LARGEST_UNSIGNED + 1.0
             remarks.append(
                 f"column {column}: counts of 32 bits without a sign, read as counts with one"
             )
@@ -118,28 +125,49 @@ def signed_counts(
 
 
 def counting_signs(reversed_axes: Sequence[str], axes: Sequence[str]) -> FloatArray:
-    """Return −1 for each axis that counts the other way in a file, 1 for the others, shape (n,)."""
-    return np.array([-1.0 if axis in reversed_axes else 1.0 for axis in axes])
+    """Return −1 for each axis that a file has in the opposite direction, else 1, shape (n,)."""
+    signs = np.ones(len(axes))
+    for index, axis in enumerate(axes):
+        if axis in reversed_axes:
+            signs[index] = -1.0
+    return signs
 
 
 def in_si(values: FloatArray, columns: PositionColumns | VelocityColumns, cell: Cell) -> FloatArray:
-    """Convert positions or velocities to rad or m, shape (k, n).
+    """Convert positions to rad or m, or velocities to rad/s or m/s.
 
-    On the joint side a prismatic axis is in mm where others are in degrees; on the motor side
-    everything is an angle.
+    On the joint side the values of a prismatic axis are in mm where others are in degrees; on the
+    motor side everything is an angle.
+
+    Args:
+        values: in the unit of the columns, shape (k, n).
+        columns: unit, and side of the gears.
+        cell: with the kinds of its axes.
+
+    Returns:
+        converted values, shape (k, n).
     """
     if columns.unit not in {PositionUnit.DEG, PositionUnit.MM, VelocityUnit.DEG, VelocityUnit.MM}:
         return values
     if columns.side is Side.JOINT:
-        units = [axis.unit.si for axis in cell.axes]
+        factors = [axis.unit.si for axis in cell.axes]
     else:
-        units = [pi / 180.0 for _ in cell.axes]
-    return values * np.array(units, dtype=np.float64)
+        factors = [pi / 180.0] * len(cell.axes)
+    return values * np.array(factors, dtype=np.float64)
 
 
 def _root_mean_square(values: FloatArray) -> FloatArray:
     """Return the root mean square of each column, shape (n,)."""
-    return np.asarray(np.sqrt(np.mean(values**2, axis=0)))
+    mean_square = np.mean(values**2, axis=0)
+    return np.asarray(np.sqrt(mean_square))
+
+
+def _integrate(velocity_rad_s: FloatArray, rate_hz: float) -> FloatArray:
+    """Integrate velocities from the first sample on, by the trapezoidal rule, shape (k, n)."""
+    steps_rad = 0.5 * (velocity_rad_s[1:] + velocity_rad_s[:-1]) / rate_hz
+    start_rad = np.zeros_like(velocity_rad_s[:1])
+    summed_rad = np.cumsum(steps_rad, axis=0)
+    return np.vstack((start_rad, summed_rad))
 
 
 def check_velocity(
@@ -150,36 +178,50 @@ def check_velocity(
     joint_rad: FloatArray,
     rate_hz: float,
 ) -> None:
-    """Compare velocity columns with the positions, by the way moved in VELOCITY_WINDOW_S:
-    it needs no derivative.
+    """Refuse velocity columns that contradict the positions.
+
+    The displacements in VELOCITY_WINDOW_S are compared: they need no derivative, which would
+    amplify noise.
+
+    Args:
+        wanted: with the columns of the velocities; without them nothing is checked.
+        cell: with drive train and velocity limits.
+        files: the tables, by the name of their file.
+        clock: of the file's time column; None without one.
+        joint_rad: positions of the joints [rad; m of a prismatic joint], shape (k, n).
+        rate_hz: rate of the samples.
+
+    Raises:
+        TableUnfit: the two differ by more than the tolerance of the import description.
     """
     velocity = wanted.velocity
     if velocity is None:
         return
     signs = counting_signs(velocity.reversed, cell.axis_names)
     of_file = section_values(velocity, files) * signs
-    stated = in_si(on_clock(of_file, clock), velocity, cell)
+    of_samples = on_clock(of_file, clock)
+    velocity_rad_s = in_si(of_samples, velocity, cell)
     if velocity.side is Side.MOTOR:
-        stated = stated @ np.linalg.inv(cell.ratio).T
-    step = max(1, round(VELOCITY_WINDOW_S * rate_hz))
-    step = min(step, len(stated) - 1)
-    # ∫ v dt, by the trapezoidal rule
-    steps = 0.5 * (stated[1:] + stated[:-1]) / rate_hz
-    summed = np.cumsum(steps, axis=0)
-    summed = np.vstack((np.zeros_like(stated[:1]), summed))
-    expected = summed[step:] - summed[:-step]
-    moved = joint_rad[step:] - joint_rad[:-step]
-    still_speeds = [STILL * axis.limits.velocity for axis in cell.axes]
-    still = np.array(still_speeds) * step / rate_hz
-    error = _root_mean_square(expected - moved)
-    size = _root_mean_square(moved)
-    largest = velocity.tolerance * size + still
-    for index in np.flatnonzero(error > largest).tolist():
-        way = moved[:, index]
-        stated_way = expected[:, index]
-        stated_square = max(float(stated_way @ stated_way), 1e-300)
-        ratio = float(way @ stated_way) / stated_square
-        error_percent = 100.0 * float(error[index]) / max(float(size[index]), 1e-300)
+        velocity_rad_s = velocity_rad_s @ np.linalg.inv(cell.ratio).T
+    window = max(1, round(VELOCITY_WINDOW_S * rate_hz))
+    window = min(window, len(velocity_rad_s) - 1)
+    integral_rad = _integrate(velocity_rad_s, rate_hz)
+    stated_rad = integral_rad[window:] - integral_rad[:-window]
+    moved_rad = joint_rad[window:] - joint_rad[:-window]
+    error_rad = _root_mean_square(stated_rad - moved_rad)
+    size_rad = _root_mean_square(moved_rad)
+    # Of an axis at rest, the tolerance alone would allow no noise.
+    noise_rad_s = np.array([SPEED_TOLERANCE * axis.limits.velocity for axis in cell.axes])
+    noise_rad = noise_rad_s * window / rate_hz
+    largest_rad = velocity.tolerance * size_rad + noise_rad
+    for index in np.flatnonzero(error_rad > largest_rad).tolist():
+        moved = moved_rad[:, index]
+        stated = stated_rad[:, index]
+        # Slope of the straight line through zero that maps stated to moved displacements.
+        stated_square = max(float(stated @ stated), SMALLEST_DIVISOR)
+        ratio = float(moved @ stated) / stated_square
+        size = max(float(size_rad[index]), SMALLEST_DIVISOR)
+        error_percent = 100.0 * float(error_rad[index]) / size
         tolerance_percent = 100.0 * velocity.tolerance
         file, column = velocity.places[index]
         raise TableUnfit(
@@ -209,7 +251,9 @@ def require_changing(
         is_constant = len(current) > 1 and not np.ptp(current[:, index])
         if is_constant and np.ptp(position[:, index]):
             value = current[0, index]
-            number = f"{value:g}" if value else "zero"
+            number = "zero"
+            if value:
+                number = f"{value:g}"
             raise TableUnfit(
                 f"{files[file].path}, column {column}",
                 found=f"{number} in every row",
@@ -219,8 +263,7 @@ def require_changing(
 
 
 def require_own_columns(section: Section, values: FloatArray, files: Mapping[str, Table]) -> None:
-    """Refuse the same numbers for two axes:
-    a copy of a column, or of a file, has the place of another one.
+    """Refuse the same numbers for two axes: one of the columns, or of the files, is a copy.
 
     Args:
         section: with the columns.
@@ -230,20 +273,20 @@ def require_own_columns(section: Section, values: FloatArray, files: Mapping[str
     Raises:
         TableUnfit: two columns that change are equal in every row.
     """
-    first_of: dict[bytes, int] = {}
+    index_by_content: dict[bytes, int] = {}
     for index in range(values.shape[1]):
-        column = values[:, index]
-        if np.unique(column).size < FEWEST_DIFFERENT:
+        numbers = values[:, index]
+        if np.unique(numbers).size < FEWEST_DIFFERENT:
             continue
-        first = first_of.setdefault(column.tobytes(), index)
-        if first == index:
+        first_index = index_by_content.setdefault(numbers.tobytes(), index)
+        if first_index == index:
             continue
-        earlier = section.places[first]
-        later = section.places[index]
+        first_file, first_column = section.places[first_index]
+        file, column = section.places[index]
         raise TableUnfit(
-            f"{files[later[0]].path}, column {later[1]}",
-            found=f"the same number as column {earlier[1]} of {earlier[0]} in all "
-            f"{len(column)} rows",
+            f"{files[file].path}, column {column}",
+            found=f"the same number as column {first_column} of {first_file} in all "
+            f"{len(numbers)} rows",
             expected="a column of its own for each axis: no two axes read alike to the last digit",
             remedy="one of them is a copy: export the axis again, and correct `file` or `columns` "
             "in the description",
@@ -253,41 +296,43 @@ def require_own_columns(section: Section, values: FloatArray, files: Mapping[str
 def check_current(
     current: FloatArray, wanted: ImportDescription, files: Mapping[str, Table]
 ) -> None:
-    """Refuse outliers: one absurd number would make the count of its column so coarse that the
+    """Refuse outliers.
+
+    A log has currents as integers. One absurd number would make their unit so coarse that the
     others become zero.
     """
     found = impossible_current(current)
-    if found is not None:
-        place = section_place(wanted.current, files, found.row, found.axis)
-        remedy = (
-            "samples are never invented: cut the recording there, by `keep`, or export it again"
-        )
-        raise found.error(TableUnfit, place, remedy)
+    if found is None:
+        return
+    place = section_place(wanted.current, files, found.row, found.axis)
+    remedy = "samples are never invented: cut the recording there, by `keep`, or export it again"
+    raise found.error(TableUnfit, place, remedy)
 
 
 def check_speed(name: str, joint_rad: FloatArray, rate_hz: float, cell: Cell) -> None:
-    """Refuse implausible speeds.
+    """Refuse speeds far above the velocity limits, and warn of speeds far below all of them.
 
-    A wrong rate scales them all; over many samples they are far above the noise.
+    A wrong rate scales every speed. Speeds are computed over many samples, where noise is small.
     """
     found = impossible_speed(joint_rad, rate_hz, cell)
     if found is not None:
+        axis_name = cell.axes[found.axis].name
         remedy = (
             "most likely rate_hz is too high, or the unit of the time column or of the "
             "positions is another"
         )
-        raise found.error(TableUnfit, f"{name}, axis {cell.axes[found.axis].name}", remedy)
+        raise found.error(TableUnfit, f"{name}, axis {axis_name}", remedy)
     limits = np.array([axis.limits.velocity for axis in cell.axes])
     shares = fastest_speeds(joint_rad, rate_hz) / limits
-    share = float(shares.max())
-    if share < SLOW_SHARE:
+    largest_share = float(shares.max())
+    if largest_share < SLOW_SHARE:
         _LOG.warning(
             "warning: %s: at %g Hz no joint is faster than %.2g %% of its velocity limit; is the "
             "rate of the recording right? A rate that is too low falsifies inertias without any "
             "other sign, and moves that slow do not identify them.",
             name,
             rate_hz,
-            100.0 * share,
+            100.0 * largest_share,
         )
 
 
@@ -299,8 +344,9 @@ def check_steps(
     clock: Clock | None,
     cell: Cell,
 ) -> None:
-    """Refuse a step between two samples that no motor makes:
-    a lost or doubled row, an angle or a counter that wraps.
+    """Refuse a step between two samples that no motor makes.
+
+    Its cause is a lost or doubled row, or an angle or a counter that wraps.
 
     Args:
         wanted: with the columns of the positions.
@@ -315,43 +361,46 @@ def check_steps(
         return
     row = found.row
     if clock is not None:
+        # The row is that of a tick; the message needs the row of the file at or after it.
         following = np.searchsorted(clock.time_s, clock.tick_s[row])
-        row = int(clock.row[min(following, len(clock.row) - 1)])
+        last = len(clock.row) - 1
+        row = int(clock.row[min(following, last)])
     place = section_place(wanted.position, files, row, found.axis)
     axis_name = cell.axes[found.axis].name
-    raise found.error(
-        TableUnfit,
-        f"{place}, axis {axis_name}",
+    remedy = (
         "cut the recording there, by `keep` of the import description, or export it again; a "
         "column that wraps (at 360 degrees, at a turn of the motor, as a counter) has to be made "
-        "continuous; in a bag, do two nodes publish the same joints on the topic?",
+        "continuous; in a bag, do two nodes publish the same joints on the topic?"
     )
+    raise found.error(TableUnfit, f"{place}, axis {axis_name}", remedy)
 
 
 def check_motion(name: str, joint_rad: FloatArray, cell: Cell) -> None:
-    """Refuse runs without motion: radians taken for degrees shrink it 57 times,
-    which limits do not reveal.
+    """Refuse runs without motion, or nearly so.
+
+    Radians taken for degrees make the motion 57 times smaller, which position limits do not reveal.
     """
     limits = np.array([axis.limits.position for axis in cell.axes])
     ranges = limits[:, 1] - limits[:, 0]
-    share = np.ptp(joint_rad, axis=0) / ranges
-    still = [cell.axes[index].name for index in np.flatnonzero(share == 0.0)]
-    if len(still) == len(cell.axes):
+    shares = np.ptp(joint_rad, axis=0) / ranges
+    still_axes = [cell.axes[index].name for index in np.flatnonzero(shares == 0.0)]
+    if len(still_axes) == len(cell.axes):
         raise PositionImplausible(
             name,
             found="positions that never change, on any axis",
             expected="a recording of an arm that moves",
             remedy="did the axes move? check the columns of `position` in the description",
         )
-    if still:
+    if still_axes:
         _LOG.warning(
             "warning: %s: the position of %s never changes; if it moved, check its encoder or "
             "its column",
             name,
-            " and ".join(still),
+            " and ".join(still_axes),
         )
-    if share.max() < SMALLEST_MOTION:
-        largest_percent = 100.0 * share.max()
+    largest_share = shares.max()
+    if largest_share < SMALLEST_MOTION:
+        largest_percent = 100.0 * largest_share
         raise PositionImplausible(
             name,
             found=f"motion over at most {largest_percent:.2g} % of any joint's range",
@@ -364,8 +413,9 @@ def check_motion(name: str, joint_rad: FloatArray, cell: Cell) -> None:
 def warn_of_unsigned(
     name: str, joint_rad: FloatArray, current_a: FloatArray, rate_hz: float, cell: Cell
 ) -> None:
-    """Warn of currents without their sign: the log can be read;
-    a fit takes it only if the motion explains them.
+    """Warn of currents without their sign.
+
+    Such a log can be read; a fit accepts it only if the motion explains the currents.
 
     Args:
         name: of the recording.

@@ -2,8 +2,8 @@
 
 Everything after a log assumes evenly spaced samples, as central differences do. A stamp is the time
 of its sample: positions at the ticks of a uniform clock come from a cubic spline through the
-samples, currents from straight lines between them. Where the stamps show a uniform clock, the
-samples stay as they are.
+samples, currents from straight lines between them. If the stamps already show a uniform clock, the
+samples are used as they are.
 """
 
 from __future__ import annotations
@@ -21,29 +21,28 @@ from daq.log.metadata import Timing
 from daq.log.table import Table
 from ident.arrays import BoolArray, FloatArray, IntArray
 
-#: Largest distance of a stamp from a uniform clock that leaves the samples as they are [periods]
-EVEN = 1e-3
-#: Spread of the rounded stamps of a uniform clock [units of their last digit]: 1, and what the fit
-#: adds
-COARSE = 1.5
-#: Steps this near to whole numbers of the usual one mean that samples are missing, not late [usual
+#: Largest distance of a stamp from a uniform clock at which the samples are not resampled [periods]
+UNIFORM_TOLERANCE = 1e-3
+#: Largest range of the differences between the rounded stamps of a uniform clock and the clock
+#: [units of their last digit]: 1 by rounding, and what the fitted period adds
+ROUNDED_RANGE = 1.5
+#: Largest distance of a step from an integer number of usual steps at which samples are missing; if
+#: it is larger, they are late [usual steps]
+INTEGER_TOLERANCE = 0.25
+#: Shortest step between two samples; a spline through closer ones amplifies their noise [usual
 #: steps]
-NEAR = 0.25
-#: Shortest step between two samples [usual steps]; a spline through closer ones amplifies their
-#: noise
-CLOSEST = 0.1
-RATE_CHANGE = 0.1
-RATE_NOISE = 6.0
-"""Largest change of the rate within a recording, beyond so many deviations of what jitter does to
-the mean of a window. A controller samples at one rate: stamps of another are of a clock that
-drifts, and scale velocities and inertias.
-"""
-RATE_WINDOWS, SHORTEST_WINDOW = 20, 50  #: Windows of a recording, and the fewest steps of one
-SLOWEST = 0.5
-QUICKEST = 2.0
-"""Rates that may be stated, in multiples of the data's:
-far below, noise folds into the band of the motion.
-"""
+SHORTEST_STEP = 0.1
+#: Largest relative change of the rate within a recording. A controller samples at one rate: stamps
+#: of two rates come from a clock that drifts, and they scale velocities and inertias.
+LARGEST_RATE_CHANGE = 0.1
+#: Change of the rate that jitter may cause in addition [σ of the mean of a window]
+RATE_NOISE_SIGMAS = 6.0
+RATE_WINDOWS = 20  #: Number of windows of a recording in which its rate is compared
+SHORTEST_WINDOW = 50  #: Fewest steps of such a window
+#: Limits of a stated rate over the rate of the stamps. Far below the rate of the stamps, noise
+#: aliases into the band of the motion.
+SMALLEST_RATE_RATIO = 0.5
+LARGEST_RATE_RATIO = 2.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,24 +54,38 @@ class Clock:
     row: IntArray  #: rows of the file that are used, shape (k,)
     time_s: FloatArray  #: their stamps since the first one [s], increasing, shape (k,)
     tick_s: FloatArray  #: ticks of the uniform clock [s], shape (m,)
-    timing: Timing  #: what the stamps showed
+    timing: Timing  #: rate, jitter and gaps of the stamps
 
     def positions(self, values: FloatArray) -> FloatArray:
-        """Return positions at the ticks, shape (m, n), by a cubic spline through those of the rows,
-        shape (k, n).
+        """Interpolate positions by a cubic spline.
+
+        Args:
+            values: positions of the rows, shape (k, n).
+
+        Returns:
+            positions at the ticks, shape (m, n).
         """
         if not self.timing.resampled:
             return values
-        return scipy.interpolate.CubicSpline(self.time_s, values)(self.tick_s)
+        spline = scipy.interpolate.CubicSpline(self.time_s, values)
+        return spline(self.tick_s)
 
     def currents(self, values: FloatArray) -> FloatArray:
-        """Return currents at the ticks, shape (m, n), by straight lines between those of the rows,
-        shape (k, n).
+        """Interpolate currents by straight lines.
+
+        Args:
+            values: currents of the rows, shape (k, n).
+
+        Returns:
+            currents at the ticks, shape (m, n).
         """
         if not self.timing.resampled:
             return values
-        resampled = [np.interp(self.tick_s, self.time_s, column) for column in values.T]
-        return np.column_stack(resampled)
+        columns = []
+        for column in values.T:
+            resampled = np.interp(self.tick_s, self.time_s, column)
+            columns.append(resampled)
+        return np.column_stack(columns)
 
 
 def on_clock(values: FloatArray, clock: Clock | None) -> FloatArray:
@@ -85,27 +98,31 @@ def on_clock(values: FloatArray, clock: Clock | None) -> FloatArray:
 def clock_of(table: Table, wanted: TimeColumn, numbers: FloatArray) -> Clock:
     """Return the clock of a recording.
 
-    Rows that repeat the one before, stamp and all, are left out; so are samples CLOSEST to the one
-    before.
+    Two kinds of rows are left out: those that repeat the row before with its stamp, and those
+    that are nearer to the row before than SHORTEST_STEP.
 
     Args:
         table: the file with the stamps.
-        wanted: the time column; its rate is that of the ticks, if it has one.
+        wanted: description of the time column; if it states a rate, the ticks have this rate.
         numbers: everything that is imported, shape (k, c).
 
     Raises:
         TableUnfit: a stamp is earlier than the one before, or repeats it with other numbers; a step
             is longer than `largest_gap_periods`; the rate is outside RATES_HZ, or changes by more
-            than RATE_CHANGE; or the stated rate is far from that of the stamps.
+            than LARGEST_RATE_CHANGE; or the stated rate is far from that of the stamps.
     """
-    assert table.stamps is not None  # its reader was asked for them
-    row = np.flatnonzero(_distinct(table, wanted, numbers))
-    time_s = table.stamps.time_s[row]
+    assert table.stamps is not None  # the description names a time column, so the reader has it
+    is_new = _is_new_row(table, wanted, numbers)
+    row = np.flatnonzero(is_new)
     duplicates = len(numbers) - len(row)
+    time_s = table.stamps.time_s[row]
+    # The first row has no row before it, and an infinite step.
     step_s = np.diff(time_s, prepend=-np.inf)
-    far = step_s >= CLOSEST * np.median(step_s)
-    row = row[far]
-    time_s = time_s[far]
+    shortest_s = SHORTEST_STEP * np.median(step_s)
+    is_far = step_s >= shortest_s
+    close = int(np.count_nonzero(~is_far))
+    row = row[is_far]
+    time_s = time_s[is_far]
     if len(row) < 3:
         raise TableUnfit(
             str(table.path),
@@ -114,26 +131,33 @@ def clock_of(table: Table, wanted: TimeColumn, numbers: FloatArray) -> Clock:
             remedy="correct `column` and `unit` of `time` in the import description, or give "
             "rate_hz instead",
         )
-    close = int(np.count_nonzero(~far))
     timing = check_stamps(time_s)
     timing = replace(timing, rows=len(numbers), duplicates=duplicates, close=close)
-    lowest_hz = RATES_HZ[0] * (1.0 - EVEN)
-    highest_hz = RATES_HZ[1] * (1.0 + EVEN)
-    if not lowest_hz <= timing.rate_hz <= highest_hz:
+    _check_range_of_rate(table, wanted, timing)
+    _check_gaps(table, wanted, row, time_s, timing)
+    _check_constant_rate(table, wanted, time_s)
+    if wanted.rate_hz is not None:
+        timing = _at_rate(table, wanted, wanted.rate_hz, time_s, timing)
+    last_s = time_s[-1]
+    last_tick = int(last_s * timing.rate_hz + UNIFORM_TOLERANCE)
+    tick_s = np.arange(last_tick + 1) / timing.rate_hz
+    tick_s = np.minimum(tick_s, last_s)  # a spline does not extrapolate
+    return Clock(row, time_s, tick_s, timing)
+
+
+def _check_range_of_rate(table: Table, wanted: TimeColumn, timing: Timing) -> None:
+    """Refuse a rate that no controller samples at: the unit of the stamps is another one."""
+    lowest_hz, highest_hz = RATES_HZ
+    # The rate comes from stamps, so its limits have the tolerance of stamps.
+    smallest_hz = lowest_hz * (1.0 - UNIFORM_TOLERANCE)
+    largest_hz = highest_hz * (1.0 + UNIFORM_TOLERANCE)
+    if not smallest_hz <= timing.rate_hz <= largest_hz:
         raise TableUnfit(
             f"{table.path}, column {wanted.column}",
             found=f"stamps at {timing.rate_hz:.4g} Hz with `unit: {wanted.unit.value}`",
-            expected=f"{RATES_HZ[0]:g} to {RATES_HZ[1]:g} Hz",
+            expected=f"{lowest_hz:g} to {highest_hz:g} Hz",
             remedy="correct `unit` of `time` in the import description: is it s, ms, us or ns?",
         )
-    _check_gaps(table, wanted, row, time_s, timing)
-    _check_rate(table, wanted, time_s)
-    if wanted.rate_hz is not None:
-        timing = _at_rate(table, wanted, wanted.rate_hz, time_s, timing)
-    last_tick = int(time_s[-1] * timing.rate_hz + EVEN)
-    tick_s = np.arange(last_tick + 1) / timing.rate_hz
-    tick_s = np.minimum(tick_s, time_s[-1])
-    return Clock(row, time_s, tick_s, timing)
 
 
 def check_stamps(time_s: FloatArray) -> Timing:
@@ -143,13 +167,14 @@ def check_stamps(time_s: FloatArray) -> Timing:
         time_s: stamps since the first one [s], increasing, shape (k,) with k > 1.
 
     Returns:
-        the timing. Its rate is that of the usual step where every step is nearly a whole number of
-        them, else the mean rate.
+        the timing. Its rate is the number of periods over the duration. A step counts as several
+            periods if every step is nearly an integer number of usual steps; else each is one.
     """
     step_s = np.diff(time_s)
     periods, usual_s = _periods(step_s)
-    rate_hz = float(periods.sum() / time_s[-1])
-    missing = round(float(periods.sum())) - len(step_s)
+    period_count = float(periods.sum())
+    rate_hz = float(period_count / time_s[-1])
+    missing = round(period_count) - len(step_s)
     clock_periods = np.concatenate(([0.0], np.cumsum(periods)))
     clock_s = clock_periods / rate_hz
     jitter_s = np.std(step_s - periods / rate_hz)
@@ -168,73 +193,91 @@ def check_stamps(time_s: FloatArray) -> Timing:
 
 
 def _periods(step_s: FloatArray) -> tuple[FloatArray, float]:
-    """Return each step in usual steps, shape (k,), all ones where they are not nearly whole;
-    and the usual step [s].
+    """Return the number of periods in each step, and the usual step.
+
+    Args:
+        step_s: steps between the stamps [s], shape (k,).
+
+    Returns:
+        integer numbers of periods, shape (k,), all 1 where one step is no such number; and the
+            usual step [s].
     """
     usual_s = float(np.median(step_s))
-    periods = np.rint(step_s / usual_s)
-    distance = np.abs(step_s / usual_s - periods)
-    if not np.all((periods >= 1.0) & (distance < NEAR)):
+    steps = step_s / usual_s
+    periods = np.rint(steps)
+    is_near = np.abs(steps - periods) < INTEGER_TOLERANCE
+    if not np.all((periods >= 1.0) & is_near):
         periods = np.ones_like(step_s)
     return periods, usual_s
 
 
-def _check_rate(table: Table, wanted: TimeColumn, time_s: FloatArray) -> None:
-    """Refuse stamps whose rate drifts or jumps;
-    jitter and missing samples leave its mean over a window alone.
+def _check_constant_rate(table: Table, wanted: TimeColumn, time_s: FloatArray) -> None:
+    """Refuse stamps if their rate drifts or jumps.
+
+    The rate is compared between windows: jitter and missing samples do not change its mean over a
+    window.
     """
     step_s = np.diff(time_s)
     periods, _ = _periods(step_s)
     period_s = step_s / periods
-    width = max(SHORTEST_WINDOW, len(period_s) // RATE_WINDOWS)
-    count = len(period_s) // width
-    if count < 2:
+    window_steps = max(SHORTEST_WINDOW, len(period_s) // RATE_WINDOWS)
+    window_count = len(period_s) // window_steps
+    if window_count < 2:
         return
-    windows = period_s[: count * width].reshape(count, width)
-    mean_s = windows.mean(axis=1)
-    jitter_s = float(np.median(windows.std(axis=1)))
-    noise = RATE_NOISE * jitter_s / (np.sqrt(width) * float(mean_s.mean()))
+    used_s = period_s[: window_count * window_steps]
+    windows_s = used_s.reshape(window_count, window_steps)
+    mean_s = windows_s.mean(axis=1)
+    std_s = windows_s.std(axis=1)
+    jitter_s = float(np.median(std_s))
+    usual_s = float(mean_s.mean())
+    noise = RATE_NOISE_SIGMAS * jitter_s / (np.sqrt(window_steps) * usual_s)
     change = mean_s.max() / mean_s.min() - 1.0
-    if change > RATE_CHANGE + noise:
+    if change > LARGEST_RATE_CHANGE + noise:
         slowest_hz = 1.0 / mean_s.max()
         quickest_hz = 1.0 / mean_s.min()
         raise TableUnfit(
             f"{table.path}, column {wanted.column}",
             found=f"stamps at {slowest_hz:.4g} to {quickest_hz:.4g} Hz in parts of the recording",
-            expected=f"one rate, to {100.0 * RATE_CHANGE:g} %",
+            expected=f"one rate, to {100.0 * LARGEST_RATE_CHANGE:g} %",
             remedy="if these are times of arrival, give rate_hz instead of time; else import the "
             "parts of one rate as recordings of their own",
         )
 
 
 def _is_uniform(time_s: FloatArray) -> bool:
-    """Whether stamps show a uniform clock: exactly, or rounded to a decimal digit.
+    """Return whether stamps show a uniform clock: exactly, or rounded to a decimal digit.
 
-    Rounding makes steps of two kinds, one unit of the digit apart, and moves every stamp by less
-    than one unit.
+    Rounding makes steps of two lengths that differ by one unit of the digit, and moves every stamp
+    by less than one unit.
     """
     middle = 0.5 * (len(time_s) - 1)
     index = np.arange(len(time_s)) - middle
+    # Slope of the straight line through the stamps, by least squares.
     period_s = float(index @ time_s / (index @ index))
-    spread_s = float(np.ptp(time_s - period_s * index))
-    if spread_s <= 2.0 * EVEN * period_s:
+    range_s = float(np.ptp(time_s - period_s * index))
+    if range_s <= 2.0 * UNIFORM_TOLERANCE * period_s:
         return True
-    for digit_s in (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6):
-        digits = time_s / digit_s
-        whole = np.rint(digits)
-        if np.all(np.abs(digits - whole) < 1e-3):
-            has_two_steps = np.ptp(np.diff(whole)) <= 1.0
-            return bool(has_two_steps and spread_s <= COARSE * digit_s)
+    for unit_s in (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6):
+        units = time_s / unit_s
+        rounded = np.rint(units)
+        distance = np.abs(units - rounded)
+        if np.all(distance < 1e-3):
+            has_two_steps = np.ptp(np.diff(rounded)) <= 1.0
+            is_near = range_s <= ROUNDED_RANGE * unit_s
+            return bool(has_two_steps and is_near)
     return False
 
 
 def _at_rate(
     table: Table, wanted: TimeColumn, rate_hz: float, time_s: FloatArray, timing: Timing
 ) -> Timing:
-    """Return the timing with a stated rate; samples stay as they are if it agrees to half a period
-    over the file.
+    """Return the timing with a stated rate.
+
+    The samples are resampled if the stated rate and that of the stamps differ by half a period or
+    more at the end of the file.
     """
-    if not SLOWEST <= rate_hz / timing.rate_hz <= QUICKEST:
+    ratio = rate_hz / timing.rate_hz
+    if not SMALLEST_RATE_RATIO <= ratio <= LARGEST_RATE_RATIO:
         raise TableUnfit(
             f"{table.path}, column {wanted.column}",
             found=f"stamps at {timing.rate_hz:.6g} Hz",
@@ -242,24 +285,30 @@ def _at_rate(
             "twice as large",
             remedy="correct `rate_hz` or `unit` of `time` in the import description",
         )
-    ahead = float(time_s[-1]) * abs(rate_hz - timing.rate_hz)  # periods at the last stamp
-    drift_s = max(timing.drift_s, ahead / rate_hz)
-    resampled = timing.resampled or ahead >= 0.5
+    last_s = float(time_s[-1])
+    difference_periods = last_s * abs(rate_hz - timing.rate_hz)
+    drift_s = max(timing.drift_s, difference_periods / rate_hz)
+    resampled = timing.resampled or difference_periods >= 0.5
     return replace(timing, rate_hz=rate_hz, drift_s=drift_s, resampled=resampled)
 
 
-def _distinct(table: Table, wanted: TimeColumn, numbers: FloatArray) -> BoolArray:
-    """Return which rows are not the row before once more, shape (k,)."""
+def _is_new_row(table: Table, wanted: TimeColumn, numbers: FloatArray) -> BoolArray:
+    """Return for each row whether it differs from the row before, shape (k,).
+
+    Raises:
+        TableUnfit: a stamp is earlier than the one before, or repeats it with other numbers.
+    """
     assert table.stamps is not None
     step_s = np.diff(table.stamps.time_s)
     has_equal_numbers = np.all(numbers[1:] == numbers[:-1], axis=1)
-    repeated = (step_s == 0.0) & has_equal_numbers
-    wrong = (step_s <= 0.0) & ~repeated
-    if wrong.any():
-        row = int(np.argmax(wrong)) + 1
-        back_s = -float(step_s[row - 1])
-        if back_s:
-            found = f"a stamp {back_s:.6g} s before that of the row above"
+    is_repeated = (step_s == 0.0) & has_equal_numbers
+    is_wrong = (step_s <= 0.0) & ~is_repeated
+    if is_wrong.any():
+        first_wrong = int(np.argmax(is_wrong))
+        row = first_wrong + 1  # step i leads to row i + 1
+        backwards_s = -float(step_s[first_wrong])
+        if backwards_s:
+            found = f"a stamp {backwards_s:.6g} s before that of the row above"
             remedy = "were two recordings joined? import each by `keep` of the import description"
         else:
             found = "the stamp of the row above, with other numbers"
@@ -269,7 +318,7 @@ def _distinct(table: Table, wanted: TimeColumn, numbers: FloatArray) -> BoolArra
             )
         place = table.place(row, wanted.column)
         raise TableUnfit(place, found=found, expected="stamps that increase", remedy=remedy)
-    return np.concatenate(([True], ~repeated))
+    return np.concatenate(([True], ~is_repeated))
 
 
 def _check_gaps(
@@ -277,15 +326,17 @@ def _check_gaps(
 ) -> None:
     """Refuse gaps: nothing is known of the motion in them."""
     step_s = np.diff(time_s)
-    longest_s = wanted.largest_gap_periods * timing.usual_step_s * (1.0 + EVEN)
+    longest_s = wanted.largest_gap_periods * timing.usual_step_s
+    longest_s *= 1.0 + UNIFORM_TOLERANCE
     gaps = np.flatnonzero(step_s > longest_s)
     if gaps.size:
         first = int(gaps[0])
         found = f"{step_s[first]:.6g} s after the sample before"
         if len(gaps) > 1:
             found += f", and {len(gaps) - 1} more gaps"
+        row_after = int(row[first + 1])
         raise TableUnfit(
-            table.place(int(row[first + 1]), wanted.column),
+            table.place(row_after, wanted.column),
             found=found,
             expected=f"at most {wanted.largest_gap_periods:g} times the usual "
             f"{timing.usual_step_s:.6g} s",

@@ -1,10 +1,10 @@
 """Access to a controller's file: which links may be followed, one writer at a time,
 and backups next to it.
 
-A backup is called FILE.<time>.<was>-<became>.bak. Both digests are the first digits of SHA-256: of
-the backup's content, and of the content that replaced it. So a backup shows by itself whether it
-was changed, and whether the controller file was changed since; there is no other file that could be
-lost or disagree.
+A backup is called FILE.<time>.<before>-<after>.bak. Both digests are the first digits of SHA-256:
+of the backup's content, and of the content that replaced it. So the name alone shows whether the
+backup was changed, and whether the controller file was changed since. No other file is needed that
+could be lost or disagree.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ from daq.writeback.request import short_digest
 def resolve_links(file: Path) -> Path:
     """Resolve the symbolic links of a file's name, those of its folders included.
 
-    A file that is gone resolves to where its links still lead.
+    If the file is gone, the result is the place to which its links still lead.
 
     Args:
-        file: as it was declared. A name that was resolved before has no links left to judge.
+        file: as it was declared, not as it was resolved: the links themselves are judged.
 
     Raises:
         ControllerUnfit: the name is too long, the links form a circle, one of them belongs to
@@ -61,7 +61,8 @@ def resolve_links(file: Path) -> Path:
             expected="a link of the file's owner, or of you, that leads to the controller's file",
             remedy="name the file itself, or make the link anew",
         ) from error
-    if (folder := open_folder(file, target)) is not None:
+    folder = open_folder(file, target)
+    if folder is not None:
         raise ControllerUnfit(
             str(file),
             found=f"a symbolic link into {folder}, a folder that everybody may write",
@@ -72,11 +73,13 @@ def resolve_links(file: Path) -> Path:
 
 
 def require_existing(file: Path) -> None:
-    """Refuse a symbolic link that leads nowhere, by that name,
-    and a file of several names (hard links).
+    """Refuse a symbolic link that leads nowhere, and a file of several names (hard links).
 
-    A new file takes the place of one name; a controller that reads another one would keep the
-    current gains.
+    A write replaces the file under one name; a controller that reads it under another one would
+    keep the current gains.
+
+    Args:
+        file: as it was declared; an error has this name.
 
     Raises:
         ControllerUnfit: for either; see also `resolve_links`.
@@ -89,11 +92,14 @@ def require_existing(file: Path) -> None:
             expected="a link that leads to the controller's file",
             remedy="correct the link, or name the file itself",
         )
-    if target.is_file() and (names := target.stat().st_nlink) > 1:
+    if not target.is_file():
+        return
+    name_count = target.stat().st_nlink
+    if name_count > 1:
         quoted = shlex.quote(str(target))
         raise ControllerUnfit(
             str(file),
-            found=f"a file with {names} names (hard links)",
+            found=f"a file with {name_count} names (hard links)",
             expected="one name: under the others the current gains would stay",
             remedy="find the others (`find / -xdev -samefile FILE`) and make symbolic links of "
             f"them, or give this name a file of its own: cp -p {quoted} {quoted}.new && mv "
@@ -103,16 +109,16 @@ def require_existing(file: Path) -> None:
 
 @contextlib.contextmanager
 def exclusive_writer(target: Path) -> Iterator[None]:
-    """Exclude other writers of a file, and remove the copies that killed ones have left.
+    """Exclude other writers of a file, and remove the copies that killed writers have left.
 
     Raises:
         CalibrationRefused: another drivegain writes it.
         OutputFailed: the lock file cannot be made, or something else has its name.
     """
     lock = target.parent / f".{target.name}.lock"
-    with contextlib.ExitStack() as held:
+    with contextlib.ExitStack() as stack:
         try:
-            held.enter_context(hold_lock(lock))
+            stack.enter_context(hold_lock(lock))
         except BlockingIOError as error:
             raise CalibrationRefused(
                 str(target),
@@ -121,8 +127,8 @@ def exclusive_writer(target: Path) -> Iterator[None]:
                 remedy="wait until it has finished, then take a new dry run",
             ) from error
         except OSError as error:
-            # Not "it is as it was": an empty lock file may stay behind where the disk refuses to
-            # remove it.
+            # The message does not say that nothing has changed: on a disk that refuses to remove
+            # it, an empty lock file may remain.
             raise OutputFailed(
                 str(lock),
                 found=reason_of(error),
@@ -136,23 +142,24 @@ def exclusive_writer(target: Path) -> Iterator[None]:
 def _remove_unfinished(target: Path) -> None:
     """Remove unfinished copies of a file and of its backups, as `replace_file` names them.
 
-    Whoever has the lock knows that no writer works on them.
+    The caller has the lock, so no writer works on them.
     """
-    name = re.compile(rf"\.{re.escape(target.name)}(\..*\.bak)?\.\d+-\d+\.tmp")
+    file_name = re.escape(target.name)
+    copy_name = re.compile(rf"\.{file_name}(\..*\.bak)?\.\d+-\d+\.tmp")
     with contextlib.suppress(OSError):
-        for found in target.parent.iterdir():
-            if name.fullmatch(found.name):
-                found.unlink(missing_ok=True)
+        for path in target.parent.iterdir():
+            if copy_name.fullmatch(path.name):
+                path.unlink(missing_ok=True)
 
 
 @dataclass(frozen=True, slots=True)
 class Backup:
-    """A backup next to a controller file; all but its content is in its name."""
+    """A backup next to a controller file; everything but its content is in its name."""
 
-    path: Path  #: file
-    stamp: str  #: time in its name
-    count: int  #: number among those of that time
-    was: str  #: digest of its content
+    path: Path  #: the backup itself
+    stamp: str  #: time in its name, in UTC, as YYYYMMDDThhmmssZ
+    count: int  #: number among the backups of that time, from 0
+    before_digest: str  #: digest of its content
     after_digest: str  #: digest of the content that replaced it in the controller file
 
     def content(self) -> bytes:
@@ -162,11 +169,12 @@ class Backup:
             ControllerUnfit: it was changed, or cannot be read.
         """
         content = read_controller_file(self.path)
-        if short_digest(content) != self.was:
+        digest = short_digest(content)
+        if digest != self.before_digest:
             raise ControllerUnfit(
                 str(self.path),
-                found=f"{len(content)} bytes with SHA-256 {short_digest(content)}…",
-                expected=f"{self.was}…, as its name says",
+                found=f"{len(content)} bytes with SHA-256 {digest}…",
+                expected=f"{self.before_digest}…, as its name says",
                 remedy="this backup was changed after it was made, and nothing was restored; if "
                 "its gains are right, copy it over the controller file by hand",
             )
@@ -174,54 +182,75 @@ class Backup:
 
 
 def backups(target: Path) -> tuple[Backup, ...]:
-    """Backups next to a controller file, oldest first."""
-    name = re.compile(
-        re.escape(target.name)
-        + r"\.([0-9]{8}T[0-9]{6}Z)(?:-([0-9]+))?\.([0-9a-f]{12})-([0-9a-f]{12})\.bak"
-    )
-    found = [
-        Backup(path, match[1], int(match[2] or 0), match[3], match[4])
-        for path in target.parent.iterdir()
-        if (match := name.fullmatch(path.name)) is not None
-    ]
-    return tuple(sorted(found, key=lambda one: (one.stamp, one.count)))
+    """Return the backups next to a controller file, oldest first."""
+    file_name = re.escape(target.name)
+    backup_name = re.compile(file_name + _AFTER_FILE_NAME)
+    found = []
+    for path in target.parent.iterdir():
+        match = backup_name.fullmatch(path.name)
+        if match is None:
+            continue
+        backup = Backup(
+            path=path,
+            stamp=match["stamp"],
+            count=int(match["count"] or 0),
+            before_digest=match["before"],
+            after_digest=match["after"],
+        )
+        found.append(backup)
+    found.sort(key=lambda backup: (backup.stamp, backup.count))
+    return tuple(found)
+
+
+_AFTER_FILE_NAME = (
+    r"\.(?P<stamp>[0-9]{8}T[0-9]{6}Z)(?:-(?P<count>[0-9]+))?"
+    r"\.(?P<before>[0-9a-f]{12})-(?P<after>[0-9a-f]{12})\.bak"
+)
+"""Pattern of a backup's name after the name of the file."""
 
 
 def backups_without_log(audit: Path, target: Path) -> int:
-    """Return the number of backups next to a controller file whose audit log is absent;
+    """Return the number of backups next to a controller file without an audit log;
     0 where there is a log.
 
-    A write that is audited leaves both: backups alone show that the log was removed or moved, or
-    that another is used.
+    An audited write leaves a log and a backup. Backups alone show that the log was removed or
+    moved, or that another log is used.
     """
     if os.path.lexists(audit):
         return 0
     try:
         return len(backups(target))
-    except OSError:  # a folder that is gone or may not be read
+    except OSError:  # the folder is gone, or may not be read
         return 0
 
 
 def back_up(target: Path, before: bytes, after: bytes, now: datetime) -> Path:
-    """Write a complete backup, later in order than every other; the caller holds the file's lock.
+    """Write a complete backup, later in order than every other; the caller has the file's lock.
 
     Mode and owner are taken from the file.
+
+    Args:
+        target: the controller file.
+        before: its content, which the backup gets.
+        after: the content that will replace it.
+        now: time, for the name.
 
     Raises:
         OSError: from the file system; no backup is left.
     """
-    order = next_order([(one.stamp, one.count) for one in backups(target)], now)
-    backup = target.with_name(
-        f"{target.name}.{order}.{short_digest(before)}-{short_digest(after)}.bak"
-    )
-    # The lock excludes every other drivegain, and time and count are beyond every backup: the name
-    # is free.
+    taken = [(backup.stamp, backup.count) for backup in backups(target)]
+    order = next_order(taken, now)
+    before_digest = short_digest(before)
+    after_digest = short_digest(after)
+    backup = target.with_name(f"{target.name}.{order}.{before_digest}-{after_digest}.bak")
+    # No file has this name: the lock excludes other processes of drivegain, and time and count are
+    # beyond every backup.
     try:
         replace_file(backup, before, like=target)
     except BaseException as error:
         backup.unlink(missing_ok=True)
         if isinstance(error, WriteUnconfirmed):
-            # It is about the backup, which is gone: the controller's file is as it was.
+            # Only the backup was unconfirmed, and it is gone: the controller's file is unchanged.
             raise OSError(error.errno, error.strerror, str(backup)) from error
         raise
     return backup
@@ -230,12 +259,19 @@ def back_up(target: Path, before: bytes, after: bytes, now: datetime) -> Path:
 def next_order(taken: Sequence[tuple[str, int]], now: datetime) -> str:
     """Return time and count for the name of a backup, later in order than all others.
 
-    A clock that was set back, or two writes in one second, must not make an older one look newer.
-    `taken` has time and count of the others, in order.
+    The count is needed where the clock was set back, or where two writes are in one second: an
+    older backup must not look newer.
+
+    Args:
+        taken: time and count of the other backups, in order.
+        now: time of the backup.
     """
     stamp = now.astimezone(UTC).strftime("%Y%m%dT%H%M%SZ")
     count = 0
     if taken and taken[-1] >= (stamp, count):
-        stamp = taken[-1][0]
-        count = taken[-1][1] + 1
-    return f"{stamp}-{count}" if count else stamp
+        last_stamp, last_count = taken[-1]
+        stamp = last_stamp
+        count = last_count + 1
+    if count == 0:
+        return stamp
+    return f"{stamp}-{count}"

@@ -1,9 +1,16 @@
 """The controller's file as a target: only the numbers of the gains change,
-and the file is replaced whole.
+and the file is replaced in one step.
 
-The order of a write: lock, the file is still the reviewed one, backup, temporary file, read back
-and compared, the file is still the same, rename. A kill at any point leaves the old file or the new
-one.
+The order of a write:
+
+1. take the lock;
+2. compare the file with the reviewed content;
+3. make a backup;
+4. write a temporary file, read it back, and compare it with the planned content;
+5. compare the file again;
+6. rename the temporary file.
+
+A kill at any point leaves the old file or the new one.
 """
 
 from __future__ import annotations
@@ -12,7 +19,7 @@ import contextlib
 import difflib
 import math
 import shlex
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
 from itertools import combinations
@@ -41,7 +48,7 @@ from daq.errors import (
 )
 from daq.files import fsync_folder, replace_file, sha256
 from daq.formats.document import comment_behind, decode_document, read_controller_file
-from daq.formats.scalar import ControllerDocument, rewrite_gain
+from daq.formats.scalar import ControllerDocument, Scalar, rewrite_gain
 from daq.writeback.file_access import (
     back_up,
     backups,
@@ -58,7 +65,7 @@ from daq.writeback.request import (
     short_digest,
 )
 from daq.writeback.target import Written
-from ident.calibration import Calibration
+from ident.calibration import Calibration, Gain
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -70,21 +77,21 @@ class FileEdit(Edit):
 
     @property
     def name(self) -> str:
-        """The file as it was named."""
+        """Name of the file, as the cell or the caller has it."""
         return str(self.file)
 
     @property
     def place(self) -> Path:
-        """The file as it was named."""
+        """The file, as the cell or the caller names it."""
         return self.file
 
     @property
     def diff(self) -> str:
         """The change as a unified diff, empty where there is none."""
+        # A name may have line ends; in the header of a diff it is one line.
         name = " ".join(self.file.name.splitlines())
-        before, after = (
-            self.document(content or b"").text for content in (self.before, self.after)
-        )
+        before = self.document(self.before or b"").text
+        after = self.document(self.after).text
         lines = difflib.unified_diff(
             before.splitlines(keepends=True),
             after.splitlines(keepends=True),
@@ -92,23 +99,32 @@ class FileEdit(Edit):
             f"{name} (calibrated)",
             n=1,
         )
-        return "".join(line if line.endswith("\n") else f"{line}\n" for line in lines)
+        text = ""
+        for line in lines:
+            text += line
+            # The last line of a file may have no line end.
+            if not line.endswith("\n"):
+                text += "\n"
+        return text
 
     @property
     def comments(self) -> dict[str, str]:
         """Comment after each gain on its line, by axis; a write leaves it as it is."""
         document = self.document(self.before or b"")
-        scalars = document.locate(tuple(change.key for change in self.changes))
-        found = {}
+        keys = tuple(change.key for change in self.changes)
+        scalars = document.locate(keys)
+        comments = {}
         for change, scalar in zip(self.changes, scalars, strict=True):
-            comment = comment_behind(document.text[scalar.end :], str(self.file), self.format)
+            text_after_gain = document.text[scalar.end :]
+            comment = comment_behind(text_after_gain, str(self.file), self.format)
             if comment:
-                found[change.axis] = comment
-        return found
+                comments[change.axis] = comment
+        return comments
 
     def document(self, content: bytes) -> ControllerDocument:
         """Parse a content in the file's format."""
-        return decode_document(content, str(self.source or self.file), self.format)
+        name = str(self.source or self.file)
+        return decode_document(content, name, self.format)
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,7 +142,7 @@ class FileTarget:
     @classmethod
     @checks_arguments(cell=of_kind(Cell), file=optional(A_PATH))
     def of(cls, cell: Cell, file: Path | None = None) -> FileTarget:
-        """The controller's file of a cell.
+        """Return the controller's file of a cell.
 
         Args:
             cell: as it is now.
@@ -141,9 +157,12 @@ class FileTarget:
         if file is not None:
             chosen = Path(file)
         if controller is None or not controller.gains or chosen is None:
+            found = "no file, or no key of each gain in it"
+            if controller is None:
+                found = "none"
             raise ConfigurationInconsistent(
                 f"cell {cell.name!r}: controller",
-                found="none" if controller is None else "no file, or no key of each gain in it",
+                found=found,
                 expected="the controller's file and the key of each gain",
                 remedy="add `controller: {file: ..., gains: [...]}` to the cell file",
             )
@@ -168,32 +187,66 @@ class FileTarget:
     def plan(self, calibration: Calibration) -> FileEdit:
         """See `Target.plan`."""
         require_axes(calibration, self.keys)
+        self._require_distinct_keys()
+        require_existing(self.file)
+        content = read_controller_file(self.file)
+        document = decode_document(content, str(self.file), self.format)
+        keys = tuple(self.keys[gain.axis] for gain in calibration.gains)
+        scalars = document.locate(keys)
+        changes = []
+        for gain, scalar in zip(calibration.gains, scalars, strict=True):
+            changes.append(self._change_of(gain, scalar))
+        self._require_distinct_numbers(scalars)
+        new_numbers = {}
+        for change in changes:
+            if change.spelling:
+                new_numbers[change.key] = change.spelling
+        after = document.with_values(new_numbers)
+        unexpected = _changed_since_recording(calibration, str(self.file), sha256(content))
+        return FileEdit(
+            subject=self.subject,
+            before=content,
+            after=after.content,
+            changes=tuple(changes),
+            unexpected=unexpected,
+            file=self.file,
+            format=self.format,
+        )
+
+    def _require_distinct_keys(self) -> None:
+        """Refuse a key of the file that two axes have.
+
+        Raises:
+            ControllerUnfit: there is one.
+        """
         keys = list(self.keys.values())
-        doubled = sorted({key for key in keys if keys.count(key) > 1})
+        doubled = {key for key in keys if keys.count(key) > 1}
         if doubled:
+            listed = ", ".join(sorted(doubled))
             raise ControllerUnfit(
                 "controller.gains",
-                found=f"{', '.join(doubled)} for more than one axis",
+                found=f"{listed} for more than one axis",
                 expected="a key of its own for each axis",
                 remedy="correct the cell configuration",
             )
-        require_existing(self.file)
-        content = read_controller_file(self.file)
-        now = decode_document(content, str(self.file), self.format)
-        scalars = now.locate(tuple(self.keys[gain.axis] for gain in calibration.gains))
-        changes = []
-        for gain, scalar in zip(calibration.gains, scalars, strict=True):
-            factor = self.factors.get(gain.axis, 1.0)
-            if is_writable(gain):
-                put = rewrite_gain(scalar, gain.value, gain.std, factor)
-            else:
-                put = None
-            planned = None if put is None else (put.new, put.spelling)
-            changes.append(
-                GainChange.of(gain, scalar.key, scalar.line, scalar.value / factor, planned)
-            )
+
+    def _change_of(self, gain: Gain, scalar: Scalar) -> GainChange:
+        """Return the change of one gain; `scalar` is its number in the file."""
+        factor = self.factors.get(gain.axis, 1.0)
+        planned = None
+        if is_writable(gain):
+            rewritten = rewrite_gain(scalar, gain.value, gain.std, factor)
+            planned = (rewritten.new, rewritten.spelling)
+        current_gain = scalar.value / factor
+        return GainChange.of(gain, scalar.key, scalar.line, current_gain, planned)
+
+    def _require_distinct_numbers(self, scalars: Sequence[Scalar]) -> None:
+        """Refuse two keys of the same number: an axis would get the gain of the other one.
+
+        Raises:
+            ControllerUnfit: there are such keys.
+        """
         for one, other in combinations(scalars, 2):
-            # An axis would get the gain of the other
             if one.start < other.end and other.start < one.end:
                 raise ControllerUnfit(
                     f"{self.file}, line {one.line}",
@@ -202,53 +255,44 @@ class FileTarget:
                     remedy="correct `controller.gains` of the cell configuration; nothing "
                     "was written",
                 )
-        after = now.with_values(
-            {change.key: change.spelling for change in changes if change.spelling}
-        )
-        return FileEdit(
-            subject=self.subject,
-            before=content,
-            after=after.content,
-            changes=tuple(changes),
-            unexpected=_changed_since_recording(calibration, str(self.file), sha256(content)),
-            file=self.file,
-            format=self.format,
-        )
 
     def plan_rollback(self) -> FileEdit:
         """See `Target.plan_rollback`: the newest backup that differs from the file."""
         target = Path(self.subject)
         if target.exists():
             before = read_controller_file(target)
+            digest = short_digest(before)
         else:
             before = None
-        found = backups(target)
+            digest = None
+        all_backups = backups(target)
         # A writer that was killed before it replaced the file leaves a backup of the present
         # content.
-        others = [one for one in found if before is None or one.was != short_digest(before)]
+        others = [backup for backup in all_backups if backup.before_digest != digest]
         if not others:
-            what = "no backup next to it"
-            if found:
-                what = f"{counted(len(found), 'backup')} with the same content"
+            found = "no backup next to it"
+            if all_backups:
+                found = f"{counted(len(all_backups), 'backup')} with the same content"
             raise CalibrationRefused(
                 str(self.file),
-                found=what,
+                found=found,
                 expected=f"{target.name}.<time>.<digests>.bak with another content",
                 remedy="nothing was changed; drivegain has not written this file since, or its "
                 "backups were moved: copy the one that you want back next to it, or over it",
             )
         backup = others[-1]
         after = backup.content()
-        if before is not None and short_digest(before) != backup.after_digest:
-            one = shlex.quote(str(backup.path))
-            other = shlex.quote(str(self.file))
+        if digest not in {None, backup.after_digest}:
+            quoted_backup = shlex.quote(str(backup.path))
+            quoted_file = shlex.quote(str(self.file))
             raise ControllerChanged(
                 str(self.file),
-                found=f"content {short_digest(before)}…",
+                found=f"content {digest}…",
                 expected=f"{backup.after_digest}…, as drivegain wrote it when it made "
                 f"{backup.path.name}",
                 remedy="the file was edited since, and a rollback would lose that; compare with "
-                f"`diff {one} {other}`; to go back all the same, `cp {one} {other}`",
+                f"`diff {quoted_backup} {quoted_file}`; to go back all the same, "
+                f"`cp {quoted_backup} {quoted_file}`",
             )
         return FileEdit(
             subject=str(target),
@@ -265,16 +309,22 @@ class FileTarget:
         target = resolve_links(self.file)
         with exclusive_writer(target):
             if edit.before is None and not target.exists():
-                found = None
+                content = None
             else:
-                found = read_controller_file(target)
-            if (str(target), found) != (edit.subject, edit.before):
+                content = read_controller_file(target)
+            if str(target) != edit.subject or content != edit.before:
+                if content is None:
+                    found = "another file"
+                else:
+                    found = f"content {short_digest(content)}…"
+                if edit.before is None:
+                    expected = "no file, as planned"
+                else:
+                    expected = f"{short_digest(edit.before)}…, as shown"
                 raise ControllerChanged(
                     str(self.file),
-                    found="another file" if found is None else f"content {short_digest(found)}…",
-                    expected="no file, as planned"
-                    if edit.before is None
-                    else f"{short_digest(edit.before)}…, as shown",
+                    found=found,
+                    expected=expected,
                     remedy="the file has changed in between: take a new dry run",
                 )
             yield
@@ -286,11 +336,15 @@ class FileTarget:
         changes = []
         for change in edit.changes:
             # "old" is the key of the current gain in every audit log.
-            numbers = {"old": change.current_gain, "new": change.new, "std": change.std}
-            finite = {
-                name: value if math.isfinite(value) else None for name, value in numbers.items()
+            entry = {
+                "axis": change.axis,
+                "key": change.key,
+                "unit": change.unit,
+                "old": _finite_or_none(change.current_gain),
+                "new": _finite_or_none(change.new),
+                "std": _finite_or_none(change.std),
             }
-            changes.append({"axis": change.axis, "key": change.key, "unit": change.unit, **finite})
+            changes.append(entry)
         return {"changes": changes}
 
     def write(self, edit: FileEdit, now: datetime, who: str) -> Written:
@@ -299,9 +353,11 @@ class FileTarget:
         if edit.before is None:
             try:
                 replace_file(target, edit.after, check=_last_check(target, edit), like=edit.source)
-            except BaseException:  # an interrupt too: the file comes back whole, or not at all
+            except BaseException:
+                # An interrupt, too: a rollback that failed leaves no file, as before. A file that
+                # another program has made meanwhile stays.
                 with contextlib.suppress(OSError):
-                    if _content(target) == edit.after:  # and not one that another program has made
+                    if _read_content(target) == edit.after:
                         target.unlink()
                 raise
             return Written(edit, None)
@@ -316,13 +372,14 @@ class FileTarget:
             # backup replaces it. A file that was saved by another program in between stays, and so
             # does the backup. A file system that allows none of this leaves both.
             with contextlib.suppress(OSError):
-                found = _content(target)
-                if found == edit.before:
+                content = _read_content(target)
+                if content == edit.before:
                     backup.unlink()
-                elif found == edit.after:
+                elif content == edit.after:
                     backup.replace(target)
                     fsync_folder(target.parent)
-            if isinstance(error, WriteUnconfirmed) and _content(target) == edit.before:
+            if isinstance(error, WriteUnconfirmed) and _read_content(target) == edit.before:
+                # The old file is in place again: the write has failed, and that is certain.
                 raise OSError(error.errno, error.strerror, str(target)) from error
             raise
         return Written(edit, backup)
@@ -337,49 +394,66 @@ _FILE_TARGET_FIELDS = {
 }
 
 
+def _finite_or_none(number: float) -> float | None:
+    """Return a number that JSON has, None for NaN and infinity."""
+    if math.isfinite(number):
+        return number
+    return None
+
+
 def _changed_since_recording(
     calibration: Calibration, file: str, base_sha256: str
 ) -> tuple[GateFinding, ...]:
-    """Compare with the first log that was recorded with another content of the file."""
+    """Return a finding for the first log that was recorded with another content of the file;
+    none where all logs have the present one.
+    """
     for log in calibration.sources:
         if log.recording is None:
-            recorded = None
-        else:
-            recorded = log.recording.controller_sha256
-        if recorded is not None and recorded != base_sha256:
-            remedy = (
-                "the file was changed since, by hand or by an earlier write: review its gains and "
-                "the diff of this dry run, and where both are right, repeat it with --base "
-                f"{base_sha256}"
-            )
-            expected = f"{recorded[:12]}…, as when {log.name} was recorded"
-            return ((file, f"content {base_sha256[:12]}…", expected, remedy),)
+            continue
+        recorded_sha256 = log.recording.controller_sha256
+        if recorded_sha256 is None or recorded_sha256 == base_sha256:
+            continue
+        found = f"content {base_sha256[:12]}…"
+        expected = f"{recorded_sha256[:12]}…, as when {log.name} was recorded"
+        remedy = (
+            "the file was changed since, by hand or by an earlier write: review its gains and "
+            "the diff of this dry run, and where both are right, repeat it with --base "
+            f"{base_sha256}"
+        )
+        return ((file, found, expected, remedy),)
     return ()
 
 
 def _last_check(target: Path, edit: FileEdit) -> Callable[[bytes], None]:
-    """Make the check right before the rename; the lock excludes every drivegain, and no editor.
+    """Return the check of the temporary file and of the target, right before the rename.
 
-    Between the check and the rename are two system calls; a file that is saved in between is still
-    lost.
+    It is needed because the lock excludes other processes of drivegain, but no editor. Between the
+    check and the rename are two system calls; a file that is saved in between is still lost.
     """
 
     def check(written: bytes) -> None:
         document = edit.document(written)
         if edit.before is None or edit.source is not None:
+            # A rollback restores a backup as it is; it only has to be readable.
             document.locate(())
         else:
-            document.check_against(
-                edit.document(edit.before), {one.key: one.spelling for one in edit.changes}
-            )
-        found = _content(target)
-        if found != edit.before:
+            document_before = edit.document(edit.before)
+            new_numbers = {change.key: change.spelling for change in edit.changes}
+            document.check_against(document_before, new_numbers)
+        content = _read_content(target)
+        if content != edit.before:
+            if content is None:
+                found = "no file any more"
+            else:
+                found = f"content {short_digest(content)}…"
+            if edit.before is None:
+                expected = "no file, as before"
+            else:
+                expected = f"{short_digest(edit.before)}…, as before this write"
             raise ControllerChanged(
                 str(target),
-                found="no file any more" if found is None else f"content {short_digest(found)}…",
-                expected="no file, as before"
-                if edit.before is None
-                else f"{short_digest(edit.before)}…, as before this write",
+                found=found,
+                expected=expected,
                 remedy="the file was saved meanwhile, and stays as it was saved: take a "
                 "new dry run",
             )
@@ -387,8 +461,8 @@ def _last_check(target: Path, edit: FileEdit) -> Callable[[bytes], None]:
     return check
 
 
-def _content(target: Path) -> bytes | None:
-    """Content of the file now, None where it is gone."""
+def _read_content(target: Path) -> bytes | None:
+    """Return the content of the file now, None where it is gone."""
     try:
         return target.read_bytes()
     except FileNotFoundError:

@@ -22,8 +22,9 @@ from ident.drift.change import DISPERSION, FALSE_ALARM, decide
 _LOG = logging.getLogger("drivegain")
 
 SAME_SIGMAS = 0.5
-"""A current gain that is as near to a gain of the history is that gain,
-rounded for the controller's file.
+"""Largest distance of a current gain from a calibrated one of the history [σ of the latter].
+
+Within it both are the same gain; the difference is the rounding in the controller's file.
 """
 
 
@@ -31,23 +32,25 @@ rounded for the controller's file.
 class Spread:
     """Figures of a history that a change is judged by; empty without a history."""
 
-    #: σ of the current gains, by axis [unit of the gain]; a gain whose σ is missing, or 0, is taken
-    #: as exact: a person entered it, or the history does not have it.
+    #: σ of the current gains, by axis [unit of the gain]. A gain without σ, or with a σ of 0, is
+    #: taken as exact: a person entered it, or the history does not have it.
     stds: Mapping[str, float] = field(default_factory=dict)
-    #: Scatter of the cell's calibrations over their σ, by axis; `ident.drift.change.DISPERSION` for
-    #: a missing one.
+    #: Scatter of the cell's calibrations over their σ, by axis. For a missing axis it is
+    #: `ident.drift.change.DISPERSION`.
     dispersions: Mapping[str, float] = field(default_factory=dict)
 
 
 NOTHING = Spread()
+"""Figures of a cell without a history."""
 
 
 @dataclass(frozen=True, slots=True)
 class JudgedChange:
     """The change of one gain, judged among all axes."""
 
-    percent: float = math.nan  #: as of `ident.drift.change.Change`
-    #: the change in σ of both as calibrations scatter, negative where the gain has decreased
+    percent: float = math.nan  #: the change, as in `ident.drift.change.Change`
+    #: the change over its σ, which includes the scatter of calibrations; negative for a gain that
+    #: has decreased
     sigmas: float = math.nan
     significant: bool = False  #: whether it is more than noise, at FALSE_ALARM over all axes
 
@@ -63,12 +66,13 @@ def query_history(
     changes: Sequence[GainChange],
     audit: Path | None = None,
 ) -> Spread:
-    """Return the figures of a cell's history; none, with a warning, where it cannot be read.
+    """Return the figures of a cell's history; without one, or with a warning if it cannot be read,
+    `NOTHING`.
 
     Args:
         cell: as it is now.
         target: the controller's file, or the drives, as the audit log names them.
-        request: calibration that is judged.
+        request: with the calibration that is judged.
         changes: of its gains.
         audit: another audit log than the cell's.
     """
@@ -90,70 +94,97 @@ def query_history(
             cell.name,
             history.renamed.new,
         )
-    return known_of(history, target, sha256(request.signed), changes)
+    digest = sha256(request.signed)
+    return known_of(history, target, digest, changes)
 
 
 def known_of(history: History, target: str, digest: str, changes: Sequence[GainChange]) -> Spread:
     """Return the figures of a history for the current gains.
 
-    The σ of a current gain is that of the calibration in force, if the gain is still that
-    calibration's. Else it is that of the newest calibration with this gain: the history lacks a
-    write after a kill, or when a backup was copied back by hand. It is 0 for a gain of no
-    calibration, such as a nameplate, which a person entered.
+    The σ of a current gain is found in this order:
 
-    The calibration that is judged, by its digest, is left out: a gain that is near to it is another
-    one unless it is in force, and the scatter is that of the others.
+    1. the calibration in force, if it has this gain;
+    2. the newest calibration with this gain. The history lacks a write after a kill, or when a
+       backup was copied back by hand;
+    3. 0 if no calibration has it: a person entered it, such as a nameplate.
+
+    The calibration that is judged is left out of the scatter. Its σ counts only if it is in force:
+    otherwise a current gain near to it has another origin.
+
+    Args:
+        history: of the cell.
+        target: the controller's file, or the drives, as the audit log names them.
+        digest: SHA-256 of the calibration that is judged.
+        changes: of its gains.
     """
-    entries = history.entries
     in_force = history.in_force(target)
-    others = [entry for entry in entries if entry.digest != digest]
-    gains = {change.axis: change.compared_gain for change in changes}
-    stds = dict.fromkeys(gains, 0.0)
-    # Oldest first, then the one in force: the last one that fits counts.
-    for entry in sorted(
-        entries if in_force == digest else others, key=lambda entry: entry.digest == in_force
-    ):
+    others = [entry for entry in history.entries if entry.digest != digest]
+    if in_force == digest:
+        candidates = list(history.entries)
+    else:
+        candidates = others
+    # Oldest first, then the one in force: the last one with the gain counts.
+    candidates = sorted(candidates, key=lambda entry: entry.digest == in_force)
+    current_gains = {change.axis: change.compared_gain for change in changes}
+    stds = dict.fromkeys(current_gains, 0.0)
+    for entry in candidates:
         for gain in entry.gains:
-            if gain.axis in gains and abs(gains[gain.axis] - gain.value) <= SAME_SIGMAS * gain.std:
+            if gain.axis not in current_gains:
+                continue
+            distance = abs(current_gains[gain.axis] - gain.value)
+            if distance <= SAME_SIGMAS * gain.std:
                 stds[gain.axis] = gain.std
-    return Spread(stds, dispersions_of(others, tuple(gains)))
+    axes = tuple(current_gains)
+    dispersions = dispersions_of(others, axes)
+    return Spread(stds, dispersions)
 
 
 def judge(changes: Sequence[GainChange], known: Spread) -> tuple[dict[str, JudgedChange], str]:
     """Judge changes by axis, and say the result in one sentence.
 
-    Left out are gains whose numbers are not finite: these have a gate of their own.
+    Gains with numbers that are not finite are left out: the gate `finite_gains` refuses them.
     """
-    comparable = [
-        change
-        for change in changes
-        if all(map(math.isfinite, (change.compared_gain, change.new, change.std)))
-        and change.std >= 0.0
-    ]
-    found = decide(
-        tuple(change.axis for change in comparable),
-        [change.compared_gain for change in comparable],
-        [known.stds.get(change.axis, 0.0) for change in comparable],
-        [change.new for change in comparable],
-        [change.std for change in comparable],
-        dispersion=[known.dispersions.get(change.axis, DISPERSION) for change in comparable],
+    comparable = [change for change in changes if _is_comparable(change)]
+    axes = tuple(change.axis for change in comparable)
+    current_gains = [change.compared_gain for change in comparable]
+    current_stds = [known.stds.get(axis, 0.0) for axis in axes]
+    new_gains = [change.new for change in comparable]
+    new_stds = [change.std for change in comparable]
+    dispersions = [known.dispersions.get(axis, DISPERSION) for axis in axes]
+    decision = decide(
+        axes,
+        current_gains,
+        current_stds,
+        new_gains,
+        new_stds,
+        dispersion=dispersions,
     )
-    judged = (
-        JudgedChange(one.percent, one.sigmas, s)
-        for one, s in zip(found.changes, found.significant, strict=True)
-    )
-    return dict(zip(found.axes, judged, strict=True)), found.words
+    judged = {}
+    decided = zip(decision.axes, decision.changes, decision.significant, strict=True)
+    for axis, change, is_significant in decided:
+        judged[axis] = JudgedChange(change.percent, change.sigmas, is_significant)
+    return judged, decision.words
+
+
+def _is_comparable(change: GainChange) -> bool:
+    """Return whether both gains and σ are numbers that a change can be computed from."""
+    numbers = (change.compared_gain, change.new, change.std)
+    is_finite = all(map(math.isfinite, numbers))
+    return is_finite and change.std >= 0.0
 
 
 def noise_note(changes: Sequence[GainChange], known: Spread) -> str:
     """Say what "more than noise" means for these changes, all from the same kind of gain."""
     exact = [change for change in changes if not known.stds.get(change.axis)]
-    taken = "σ of both gains is taken into account"
+    sigma_note = "σ of both gains is taken into account"
     if exact:
-        listed = ", ".join(change.axis for change in exact)
-        whose = "all axes" if len(exact) == len(changes) else listed
-        taken = f"the {exact[0].compared_with.value} is taken as exact on {whose}"
+        origin = exact[0].compared_with.value
+        exact_axes = ", ".join(change.axis for change in exact)
+        if len(exact) == len(changes):
+            exact_axes = "all axes"
+        sigma_note = f"the {origin} is taken as exact on {exact_axes}"
+    false_alarm_percent = 100 * FALSE_ALARM
     return (
         "more than noise: the probability that noise alone makes such a change, on any axis, is "
-        f"below {100 * FALSE_ALARM:g} %; {taken}"
+        f"below {false_alarm_percent:g} %; {sigma_note}"
     )
