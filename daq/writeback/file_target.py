@@ -312,7 +312,14 @@ class FileTarget:
                 content = None
             else:
                 content = read_controller_file(target)
-            if str(target) != edit.subject or content != edit.before:
+            if str(target) != edit.subject:
+                raise ControllerChanged(
+                    str(self.file),
+                    found=f"a link that leads to {target}",
+                    expected=f"{edit.subject}, as shown",
+                    remedy="the link has changed in between: take a new dry run",
+                )
+            if content != edit.before:
                 if content is None:
                     found = "another file"
                 else:
@@ -378,7 +385,10 @@ class FileTarget:
                 elif content == edit.after:
                     backup.replace(target)
                     fsync_folder(target.parent)
-            if isinstance(error, WriteUnconfirmed) and _read_content(target) == edit.before:
+            is_old_in_place = False
+            with contextlib.suppress(OSError):
+                is_old_in_place = _read_content(target) == edit.before
+            if is_old_in_place and isinstance(error, WriteUnconfirmed):
                 # The old file is in place again: the write has failed, and that is certain.
                 raise OSError(error.errno, error.strerror, str(target)) from error
             raise

@@ -242,6 +242,23 @@ def test_two_names_of_one_number_are_refused(
         propose(target, Request(two, NOW))
 
 
+def test_a_link_that_leads_elsewhere_since_the_dry_run_is_named(
+    controller: Path, tmp_path: Path
+) -> None:
+    link = tmp_path / "current.yaml"
+    link.symlink_to(controller)
+    proposal = _propose(demo_calibration(), link)
+    copy = tmp_path / "copy.yaml"
+    shutil.copyfile(controller, copy)
+    link.unlink()
+    link.symlink_to(copy)
+    with pytest.raises(
+        ControllerChanged, match=rf"found a link that leads to {copy}; expected {controller}, as"
+    ):
+        apply(proposal, NOW)
+    assert copy.read_bytes() == controller.read_bytes()
+
+
 def test_a_symbolic_link_stays_one(controller: Path, tmp_path: Path) -> None:
     link = tmp_path / "link.yaml"
     link.symlink_to(controller)
