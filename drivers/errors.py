@@ -347,14 +347,15 @@ class SampleLost(DriverError):
     ) -> None:
         if silent_s is None:
             text = f"no answer from {', '.join(names)}"
-            for name, error in zip(names, reported, strict=False):
-                who = "it" if len(names) == 1 else name
-                if error:
-                    text = f"{text}; {who} had reported {error}"
         else:
             text = (
                 f"no axis answered within {silent_s:.3g} s; check the power of the cell and the bus"
             )
+        for name, error in zip(names, reported, strict=False):
+            if error and len(names) == 1:
+                text = f"{text}; it had reported {error}"
+            elif error:
+                text = f"{text}; {name} had reported {error}"
         super().__init__(f"cycle {cycle}: {text}")
         self.cycle = cycle
         self.axes = axes

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from daq.cli.failure import ErrorParts
-from daq.cli.output import wait_until_shown
+from daq.cli.output import output_error, wait_until_shown
 from daq.cli.terminal import interruptible, output_console, progress_bar, say_last
 from daq.cli.verb import (
     CellArgument,
@@ -32,7 +32,7 @@ from daq.cli.verb import (
     taking,
 )
 from daq.environment import login
-from daq.errors import ExitCode, JobHeld, UsageError
+from daq.errors import ExitCode, JobHeld, UsageError, reason_of
 from daq.report.text import printable
 from drivers.errors import MotionRefused, stop_notes
 
@@ -210,7 +210,7 @@ def ask_word(question: str, word: str) -> bool:
     the question is asked again.
 
     Raises:
-        JobHeld: the input has ended.
+        JobHeld: as `ask`.
     """
     while True:
         answer = ask(question)
@@ -228,13 +228,16 @@ def ask(question: str) -> str:
     often before must not start the robot.
 
     Raises:
-        JobHeld: the input has ended.
+        JobHeld: the input has ended, or the question cannot be shown.
     """
     _show_question(question)
     while not _shown_at_once():
         tell("")  # the person has not seen it before, and may have typed meanwhile
         _show_question(question)
-    answer = sys.stdin.readline()
+    _require_shown(question)
+    answer = ""
+    if sys.stdin is not None:  # it is None where the input was closed
+        answer = sys.stdin.readline()
     if not answer:
         typer.echo("", err=True)
         raise JobHeld(
@@ -259,12 +262,34 @@ def _shown_at_once() -> bool:
     return time.monotonic() - began_s < SHOWN_WITHIN_S
 
 
+def _require_shown(question: str) -> None:
+    """Refuse to take an answer to a question that went nowhere: it may start the robot.
+
+    Raises:
+        JobHeld: the error output is closed, or takes nothing.
+    """
+    found = ""
+    if sys.stderr is None:
+        found = "the error output is closed"
+    else:
+        error = output_error(sys.stderr)
+        if error is not None:
+            found = f"the error output takes nothing: {reason_of(error)}"
+    if found:
+        raise JobHeld(
+            question,
+            found=f"a question that cannot be shown; {found}",
+            expected="an operator who sees it",
+            remedy="start the same command in a terminal; the session goes on where it is",
+        )
+
+
 def _discard_typed_ahead() -> bool:
     """Discard what waits in the terminal's input; return whether a whole line did.
 
     The lines of a pipe stay: a script writes its answers before it is asked.
     """
-    if not sys.stdin.isatty():
+    if sys.stdin is None or not sys.stdin.isatty():
         return False
     waiting_bytes = array("i", [0])
     ioctl(sys.stdin, termios.FIONREAD, waiting_bytes)

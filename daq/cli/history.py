@@ -181,7 +181,8 @@ def history_verb(
             say_verification(checked, console)
         elif axis is not None:
             show_axis(chosen[0], all_series, actions, console)
-        elif history.entries or not history.may_lack:
+        elif history.entries or not (history.may_lack or rename):
+            # Before a rename is made, the new name has no history yet.
             show_history(history.entries, all_series, actions, console)
         say_written(console, plot, csv)
     if checked is not None:
@@ -364,6 +365,7 @@ def _say_names(history: History, cell_file: Path) -> None:
             history.renamed.at,
             history.renamed.remedy,
         )
+        return
     for name in history.possible_names:
         command = f"drivegain history {shlex.quote(str(cell_file))} --rename {shlex.quote(name)}"
         _LOG.warning(

@@ -392,6 +392,14 @@ def has_reader(stream: object) -> bool:
     return writer is None or writer.has_reader
 
 
+def output_error(stream: object) -> OSError | None:
+    """The error of a stream that takes nothing any more; None where it has none."""
+    writer = writer_of(stream)
+    if writer is None:
+        return None
+    return writer.error
+
+
 def release_results() -> None:
     """Let the command end without a reader of its results: an interrupt has ended it."""
     writer = writer_of(sys.stdout)

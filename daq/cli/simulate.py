@@ -278,7 +278,8 @@ def how_to_reach(parts: Sequence[BusPart], period_us: int) -> str:
         for part in parts
     )
     return (
-        "To reach it, replace `bus` and `sync` in the cell file with:\n\n"
+        "A cell of `drivegain init --simulated` reaches it as it is. In another cell file, replace "
+        "`bus` and `sync` with:\n\n"
         f"bus:\n{buses}sync:\n  period_us: {period_us}\n  pacing: {pacing}\n\n"
         + (f"{nodes}\n" if several else "")
         + "and try it in a second terminal: drivegain scan CELL"

@@ -269,6 +269,11 @@ def parse_yaml(text: bytes, name: str) -> Document:
         if found == "but found another document":
             found = "a second document, behind `---`"
             remedy = "remove this line and what is below it, or give that a file of its own"
+        hidden = _HIDDEN_LINE_END.search(text.decode("utf-8", errors="replace"))
+        if hidden is not None:
+            found = f"{found}; the file has a character that ends a line and is not to be seen, "
+            found += f"U+{ord(hidden[0]):04X}"
+            remedy = "remove that character: it comes with text from a page or a document"
         raise YamlInvalid(
             f"{name}:{line}", found=found, expected="one YAML document", remedy=remedy
         ) from error
@@ -288,13 +293,12 @@ def _check_encoding(text: bytes, name: str) -> None:
     """Refuse bytes that are no UTF-8, with their line; libyaml has no place for them.
 
     Raises:
-        YamlInvalid: a byte is in another encoding, or a line ends with a character that is not to
-            be seen. UTF-16 with its mark is left to libyaml.
+        YamlInvalid: a byte is in another encoding. UTF-16 with its mark is left to libyaml.
     """
     if text.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return
     try:
-        decoded = text.decode("utf-8")
+        text.decode("utf-8")
     except UnicodeDecodeError as error:
         line = text.count(b"\n", 0, error.start) + 1
         raise YamlInvalid(
@@ -303,15 +307,6 @@ def _check_encoding(text: bytes, name: str) -> None:
             expected="one YAML document in UTF-8",
             remedy="save the file as UTF-8; is this the right file?",
         ) from error
-    hidden = _HIDDEN_LINE_END.search(decoded)
-    if hidden is not None:
-        line = decoded.count("\n", 0, hidden.start()) + 1
-        raise YamlInvalid(
-            f"{name}:{line}",
-            found=f"an invisible character that ends a line (U+{ord(hidden[0]):04X})",
-            expected="lines that end with a line feed",
-            remedy="remove it: it comes with text that was copied from a page or a document",
-        )
 
 
 def _check_events(text: bytes, name: str) -> None:

@@ -665,8 +665,11 @@ def next_step_after(error: BaseException, cell_file: Path, session: Session) -> 
 
 
 def go_on(state: GuidedState) -> str:
-    """Say how to go on with a session that an error has interrupted."""
-    return f"remove the cause, then start the same command: {goes_on_with(state)}"
+    """Say how to go on with a session that an error, or its operator, has interrupted."""
+    start = "remove the cause, then start the same command"
+    if state.outcome is Outcome.INTERRUPTED:
+        start = "start the same command"
+    return f"{start}: {goes_on_with(state)}"
 
 
 def fit_corrected_command(cell_file: Path, session: Session) -> str:

@@ -163,6 +163,7 @@ SENTENCES = {
     "up": "! The unfinished session in {folder} is not continued: {reason}.",
     "drives are as declared, without fault and without "
     "power": "Checked: disk, history, interlock, drives.",
+    "planning": "Planning {duration_s:g} s of moves; a busy computer takes minutes.",
     "longer blocks": "{asked_s:g} s of moves are too short: found {found}; expected {expected}. "
     "The moves take {duration_s:g} s instead.",
     "moves to look at": "\nMoves to look at: {page}",

@@ -71,8 +71,8 @@ def geometry_notes(
         if others:
             yield (
                 f"With the description as it is ({', '.join(others)} not corrected), {by} "
-                f"put gravity {size}: its σ does not cover that, so correct it first, and fit "
-                "again."
+                f"put gravity {size}. This σ does not cover {', '.join(others)}: correct that "
+                "first, and fit again."
             )
         else:
             yield f"By {by}, gravity is {size}."

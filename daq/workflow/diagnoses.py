@@ -50,6 +50,7 @@ from ident.data.run import Run
 from ident.discovery.current_filter import CurrentFilter
 from ident.discovery.effect_verdict import Judgement
 from ident.discovery.evidence import Evidence, coefficients_of
+from ident.discovery.gates import in_noise
 from ident.discovery.geometry_check import GeometryCheck, check_geometry
 from ident.discovery.hidden_zeros import ZeroHiddenBy, zero_hidden_by
 from ident.discovery.loop import Step
@@ -440,9 +441,11 @@ def open_correction_diagnoses(
     for aside in last.set_aside:
         finding = aside.finding
         placed = finding.placed
-        # What left by its own σ may be zero.
+        # What left by its own σ may be zero; so may what is not significant as it was found.
         is_known = placed in last.after.effects or placed in last.left_open
-        if is_correction(placed) and not is_known:
+        covariance = np.diag(finding.deviations**2)
+        may_be_zero = bool(in_noise(finding.coefficients, covariance))
+        if is_correction(placed) and not is_known and not may_be_zero:
             why = aside.reason(cell.place_names)
             found.append(
                 _open_correction(

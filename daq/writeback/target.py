@@ -170,7 +170,7 @@ class Proposal(Generic[E]):
             self.edit.subject,
             found=f"{len(self.refusals)} failed checks{lines}\n ",
             expected="none",
-            remedy="nothing was written",
+            remedy="nothing was written; each line ends with what to do",
         )
 
 
@@ -296,7 +296,7 @@ def rollback(
 
     Raises:
         UsageError: an argument is of another type; nothing was written.
-        CalibrationRefused: see `Target.plan_rollback`.
+        CalibrationRefused: see `Target.plan_rollback`; or the last write was begun and never made.
         CalibrationRefused, DriverError, OSError: see `Target.lock` and `Target.write`.
         AuditUnusable: the beginning could not be recorded; nothing was written.
     """
@@ -308,8 +308,12 @@ def rollback(
         subject = planned.subject
     recorder = _Recorder(audit, who, now, subject)
     with recorder.refusals(refused_details):
-        edit = planned or target.plan_rollback()
-    _warn_of_unmade_write(recorder)
+        try:
+            edit = planned or target.plan_rollback()
+        except CalibrationRefused:
+            # There is no earlier write either: the reason is the same.
+            _require_made_write(recorder)
+            raise
     actions = (AuditAction.ROLLBACK_BEGUN, AuditAction.ROLLED_BACK)
     return _write(target, edit, recorder, actions, target.details(edit), refused_details)
 
@@ -339,6 +343,9 @@ def _write(
     with contextlib.ExitStack() as lock:
         with recorder.refusals(refused_details):
             lock.enter_context(target.lock(edit))
+            if begun_action is AuditAction.ROLLBACK_BEGUN:
+                # Under the lock: a write that still goes on is no write that was never made.
+                _require_made_write(recorder)
         digest_before = None if edit.before is None else sha256(edit.before)
         digest_after = sha256(edit.after)
         begun = recorder.begin(
@@ -376,10 +383,16 @@ def _write(
         return written
 
 
-def _warn_of_unmade_write(recorder: _Recorder) -> None:
-    """Warn where the last write was begun and never made: the one before it is taken back then.
+def _require_made_write(recorder: _Recorder) -> None:
+    """Refuse to take back more than the last write where that was begun and never made.
+
+    The file is as it was before the write that its operator wants to undo; a rollback would undo
+    the write before that. A rollback that was begun and never made is made now.
 
     An audit log that cannot be read tells of none; what follows refuses it by name.
+
+    Raises:
+        CalibrationRefused: the last write is an `apply` that was never made.
     """
     if recorder.audit is None:
         return
@@ -393,14 +406,17 @@ def _warn_of_unmade_write(recorder: _Recorder) -> None:
         if one.action in _BEGINNINGS and one.subject == recorder.subject
     ]
     unmade = [one.begun for one in verdict.open_writes if one.content is Content.BEFORE]
-    if not begun or begun[-1] not in unmade:
+    if not begun or begun[-1] not in unmade or begun[-1].action is not AuditAction.APPLY_BEGUN:
         return
-    _LOG.warning(
-        "the last write to %s, begun by %s at %s, was never made, because its program was ended "
-        "before; the write before it is taken back now, and a second rollback brings it back",
+    last = begun[-1]
+    raise CalibrationRefused(
         recorder.subject,
-        begun[-1].who,
-        begun[-1].at,
+        found=f"a last write, begun by {last.who} at {last.at}, that was never made: its program "
+        "was ended before",
+        expected="a write to take back",
+        remedy="nothing was changed, and nothing is to be undone: the file is as it was before "
+        "that write; to take back the write before it all the same, copy its backup "
+        f"({Path(recorder.subject).name}.<time>.<digests>.bak) over the file",
     )
 
 

@@ -162,6 +162,8 @@ def test_a_lost_sample_names_the_silent_axes_or_says_that_none_answers() -> None
     assert str(error) == "cycle 12: no answer from J3; it had reported EMCY 8130h life guard error"
     silent = SampleLost(12, (0, 1, 2), ("J1", "J2", "J3"), 0.12345)
     assert str(silent).startswith("cycle 12: no axis answered within 0.123 s; check the power")
+    small = SampleLost(12, (0,), ("J1",), 0.5, ("EMCY 8130h life guard error",))
+    assert str(small).endswith("and the bus; it had reported EMCY 8130h life guard error")
 
 
 def test_refused_motion_says_what_was_found_and_what_to_do() -> None:

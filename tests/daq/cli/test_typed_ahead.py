@@ -111,6 +111,31 @@ def test_the_lines_of_a_pipe_are_answers(monkeypatch: pytest.MonkeyPatch, tmp_pa
             ask("Anything else")
 
 
+def test_an_answer_to_a_question_that_went_nowhere_starts_nothing(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    answers = tmp_path / "answers"
+    answers.write_text("\n\n", encoding="utf-8")
+    with answers.open(encoding="utf-8") as pipe:
+        monkeypatch.setattr(sys, "stdin", pipe)
+        with (
+            Path("/dev/full").open("wb") as full,
+            printing_to(full.fileno()),
+            pytest.raises(JobHeld, match="a question that cannot be shown; the error output takes"),
+        ):
+            ask("The robot moves now")
+        monkeypatch.setattr(sys, "stderr", None)
+        with pytest.raises(JobHeld, match="cannot be shown; the error output is closed"):
+            ask("The robot moves now")
+        assert pipe.readline() == "\n"  # no answer was taken
+
+
+def test_a_closed_input_is_one_that_has_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "stdin", None)
+    with pytest.raises(JobHeld, match="no answer: the input has ended"):
+        ask("Mass")
+
+
 def test_what_was_typed_before_a_stalled_screen_shows_the_question_does_not_answer_it(
     terminal: Terminal,
 ) -> None:

@@ -165,13 +165,20 @@ def test_what_yaml_allows_and_a_configuration_must_not(text: str, line: str, fou
 
 
 @pytest.mark.parametrize("character", ["\u0085", "\u2028", "\u2029"])
-def test_a_character_that_ends_a_line_and_is_not_to_be_seen_is_named(character: str) -> None:
-    text = f"a: 1\nname: press{character}4\n"
+def test_a_character_that_ends_a_line_and_is_not_to_be_seen_is_named_where_it_breaks_the_file(
+    character: str,
+) -> None:
+    text = f"a: 1\nname: press{character}4\nb: 2\n"
     with pytest.raises(YamlInvalid) as caught:
         parse_yaml(text.encode(), "cell.yaml")
-    named = f"U+{ord(character):04X}"
-    assert "cell.yaml:2" in str(caught.value)
-    assert f"an invisible character that ends a line ({named})" in str(caught.value)
+    assert f"U+{ord(character):04X}" in str(caught.value)
+    assert "remove that character" in str(caught.value)
+
+    # Logs of before have such files: where nothing is broken by it, it is read.
+    in_quotes = f'a: 1\nname: "press{character}4"\n'
+    assert parse_yaml(in_quotes.encode(), "cell.yaml").tree["a"] == 1
+    in_comment = f"# one{character}\na: 1\n"
+    assert parse_yaml(in_comment.encode(), "cell.yaml").tree == {"a": 1}
 
 
 def test_a_tab_before_a_comment_is_read() -> None:

@@ -513,6 +513,12 @@ def test_a_zero_that_the_search_has_set_aside_is_named_and_one_in_its_noise_is_n
     in_its_noise = replace(step, left_open=left_open)
     assert description_diagnoses(replace(fitted, steps=(in_its_noise,))) == ()
 
+    # One that may be zero as it was found asks for no correction of the cell file.
+    uncertain = passed_finding(ZeroOffset(), 1, 1.5 * std, std)
+    aside = SetAside(uncertain, "in the joint fit it no longer passes")
+    not_significant = replace(step, set_aside=(aside,))
+    assert description_diagnoses(replace(fitted, steps=(not_significant,))) == ()
+
 
 def test_an_undecided_zero_is_named_and_refuses_the_gains_and_is_in_their_sigma(
     three_axis_cell: Cell, recorded: Runs, monkeypatch: pytest.MonkeyPatch

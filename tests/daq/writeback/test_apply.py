@@ -456,31 +456,51 @@ def test_a_write_that_was_killed_half_way_is_passed_over(controller: Path) -> No
     assert controller.read_bytes() == original
 
 
-@pytest.mark.parametrize("has_refusal_since", [False, True])
-def test_a_rollback_says_that_the_last_write_was_never_made(
-    controller: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, has_refusal_since: bool
+def _kill_a_write(
+    controller: Path, audit: Path, action: AuditAction = AuditAction.APPLY_BEGUN
 ) -> None:
-    audit = tmp_path / "audit.jsonl"
-    original = controller.read_bytes()
-    proposal = _propose(demo_calibration(), controller)
-    apply(proposal, NOW, audit=audit, who="anna")
-    rollback(FileTarget(controller), NOW, audit=audit, who="anna")
-    apply(_propose(demo_calibration(), controller), NOW, audit=audit, who="anna")
-    assert "never made" not in caplog.text
+    """Leave what a writer leaves that is killed before it makes its write."""
     digests = {
         "sha256_before": hashlib.sha256(controller.read_bytes()).hexdigest(),
         "sha256_after": hashlib.sha256(b"never written").hexdigest(),
     }
     subject = str(controller.resolve())
-    killed = AuditAction.APPLY_BEGUN
-    record_write(audit, killed, at=NOW, who="bert", subject=subject, details=digests)
-    if has_refusal_since:
-        refused = AuditAction.REFUSED
-        record_write(audit, refused, at=NOW, who="bert", subject=subject, details={})
+    record_write(audit, action, at=NOW, who="bert", subject=subject, details=digests)
+
+
+@pytest.mark.parametrize("is_tried_again", [False, True])
+@pytest.mark.parametrize("has_earlier_write", [False, True])
+def test_a_write_that_was_never_made_is_not_rolled_back_in_the_place_of_another(
+    controller: Path, tmp_path: Path, is_tried_again: bool, has_earlier_write: bool
+) -> None:
+    audit = tmp_path / "audit.jsonl"
+    if has_earlier_write:
+        apply(_propose(demo_calibration(), controller), NOW, audit=audit, who="anna")
+    before = controller.read_bytes()
+    _kill_a_write(controller, audit)
+    for _ in range(2 if is_tried_again else 1):
+        with pytest.raises(
+            CalibrationRefused,
+            match=r"begun by bert at 2025-.*, that was never made.*nothing is to be undone",
+        ):
+            rollback(FileTarget(controller), NOW, audit=audit, who="bert")
+    assert controller.read_bytes() == before
+    # The next write is made, and can be taken back.
+    if not has_earlier_write:
+        apply(_propose(demo_calibration(), controller), NOW, audit=audit, who="bert")
+        rollback(FileTarget(controller), NOW, audit=audit, who="bert")
+        assert controller.read_bytes() == before
+
+
+def test_a_rollback_that_was_never_made_is_made_by_the_next_one(
+    controller: Path, tmp_path: Path
+) -> None:
+    audit = tmp_path / "audit.jsonl"
+    original = controller.read_bytes()
+    apply(_propose(demo_calibration(), controller), NOW, audit=audit, who="anna")
+    _kill_a_write(controller, audit, AuditAction.ROLLBACK_BEGUN)
     rollback(FileTarget(controller), NOW, audit=audit, who="bert")
     assert controller.read_bytes() == original
-    said = f"the last write to {subject}, begun by bert at {NOW.isoformat()}, was never made"
-    assert said in caplog.text
 
 
 def test_a_backup_that_is_no_yaml_is_not_restored(controller: Path) -> None:
