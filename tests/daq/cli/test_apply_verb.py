@@ -122,7 +122,7 @@ def with_fourth_gain(calibration: Calibration, factor: float) -> Calibration:
 
 
 def run_in_process(arguments: list[str], stdout: int | IO[str]) -> subprocess.CompletedProcess[str]:
-    """Run the command line in a process of its own."""
+    """Run the command line in a new process."""
     command = [sys.executable, "-m", "daq", *arguments]
     return subprocess.run(command, stdout=stdout, stderr=subprocess.PIPE, text=True, check=False)
 

@@ -145,6 +145,13 @@ def _coloured_view(report: MonitorReport) -> str:
     return out.getvalue()
 
 
+def _reply(bus: QuietBus, request: can.Message, data: bytes, after_ns: int = 0) -> None:
+    """Let a node answer an SDO request, now or after a while."""
+    at_ns = bus.clock.now_ns + after_ns
+    answer = frame(request.arbitration_id - 0x80, data)
+    bus.coming.append((at_ns, answer))
+
+
 def _upload(request: bytes, value: int = 0) -> bytes:
     """Data of the answer to an SDO request, with a value of four bytes."""
     index_and_subindex = request[1:4]
@@ -196,8 +203,7 @@ def test_asking_leaves_the_bus_to_others(bus: QuietBus, monkeypatch: pytest.Monk
     def answer(msg: can.Message, timeout: float | None = None) -> None:
         nonlocal answered
         answered += 1
-        reply = frame(msg.arbitration_id - 0x80, _upload(msg.data))
-        bus.coming.append((bus.clock.now_ns, reply))
+        _reply(bus, msg, _upload(msg.data))
 
     monkeypatch.setattr(bus, "send", answer)
     reading = monitor.watch(5.0)
@@ -241,7 +247,7 @@ def _reading(counts: list[int | None]) -> CellReading:
 
 
 def _reading_of(axes: Sequence[AxisReading]) -> CellReading:
-    """Half a second in which axes were asked."""
+    """Half a second in which axes were queried."""
     return CellReading(ReadingSource.ASKED, 0.5, tuple(axes), 0.0, ((0,) * 9,), ())
 
 
@@ -500,9 +506,8 @@ def _answering(
     def answer(msg: can.Message, timeout: float | None = None) -> None:
         request = bytes(msg.data)
         node = msg.arbitration_id & 0x7F
-        reply = own(request) or _upload(request)
-        at_ns = bus.clock.now_ns + delays_ns.get(node, 0)
-        bus.coming.append((at_ns, frame(msg.arbitration_id - 0x80, reply)))
+        data = own(request) or _upload(request)
+        _reply(bus, msg, data, after_ns=delays_ns.get(node, 0))
         bus.coming.sort(key=lambda one: one[0])
 
     monkeypatch.setattr(bus, "send", answer)
@@ -655,7 +660,7 @@ def test_the_predicted_current_is_shown_beside_the_measured_one_and_only_a_wrong
     assert report.prediction is not None
     assert report.prediction.remark == "no prediction: there is no SYNC"
     silent = [axis.axis for axis in report.axes if axis.silent]
-    assert silent == []  # they were not asked
+    assert silent == []  # they were not queried
 
 
 def test_the_rate_of_another_master_is_measured_once_its_sync_is_steady(
@@ -694,8 +699,7 @@ def test_queried_axes_are_too_slow_for_a_prediction_and_their_faults_have_a_reme
         value = 0
         if msg.arbitration_id == 0x603:
             value = values.get(index, 0)
-        reply = _upload(msg.data, value)
-        bus.coming.append((bus.clock.now_ns, frame(msg.arbitration_id - 0x80, reply)))
+        _reply(bus, msg, _upload(msg.data, value))
 
     monkeypatch.setattr(bus, "send", answer)
     feed = Feed(tmp_path / "cell.yaml", stop=None)

@@ -465,7 +465,9 @@ def test_a_planar_loop_closes_beside_its_plane(
     tip = re.search(r'<joint name="tip-2" type="fixed">\s*<origin xyz="(\S+) (\S+) (\S+)"', urdf)
     assert tip is not None
     raised_m = float(tip[3]) + 0.03
-    raised = tip[0].replace(f'{tip[2]} {tip[3]}"', f'{tip[2]} {raised_m:g}"')
+    coordinates = f'{tip[2]} {tip[3]}"'
+    raised_coordinates = f'{tip[2]} {raised_m:g}"'
+    raised = tip[0].replace(coordinates, raised_coordinates)
     raised_urdf = urdf.replace(tip[0], raised)
     cell = _cell_with_description(tmp_path, "five-bar", raised_urdf)
     exported = export(calibrated_robot(cell), tmp_path, capsys)
