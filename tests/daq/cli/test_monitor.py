@@ -203,7 +203,7 @@ def test_asking_leaves_the_bus_to_others(bus: QuietBus, monkeypatch: pytest.Monk
     def answer(msg: can.Message, timeout: float | None = None) -> None:
         nonlocal answered
         answered += 1
-        _reply(bus, msg, _upload(msg.data))
+        _reply(bus, msg, _upload(bytes(msg.data)))
 
     monkeypatch.setattr(bus, "send", answer)
     reading = monitor.watch(5.0)
@@ -699,7 +699,7 @@ def test_queried_axes_are_too_slow_for_a_prediction_and_their_faults_have_a_reme
         value = 0
         if msg.arbitration_id == 0x603:
             value = values.get(index, 0)
-        _reply(bus, msg, _upload(msg.data, value))
+        _reply(bus, msg, _upload(bytes(msg.data), value))
 
     monkeypatch.setattr(bus, "send", answer)
     feed = Feed(tmp_path / "cell.yaml", stop=None)

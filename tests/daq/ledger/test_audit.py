@@ -86,10 +86,10 @@ def _filled(path: Path, count: int = 6) -> tuple[AuditEntry, ...]:
 
 
 def _append(
-    path: Path, action: AuditAction, subject: str, details: dict[str, object]
+    path: Path, action: AuditAction, subject: str, details: dict[str, object], who: str = "K."
 ) -> AuditEntry:
     """Append an entry of someone."""
-    return append(path, action, at=NOW, who="K.", subject=subject, details=details)
+    return append(path, action, at=NOW, who=who, subject=subject, details=details)
 
 
 def _add_bytes(path: Path, content: bytes) -> None:
@@ -359,7 +359,7 @@ def test_what_is_left_of_a_first_entry_is_no_other_file(tmp_path: Path) -> None:
     for length in range(len(content) - 1):
         path = tmp_path / str(length)
         path.write_bytes(content[:length])
-        one = _append(path, AuditAction.APPLIED, "", {})
+        one = _append(path, AuditAction.APPLIED, "", {}, who="")
         if length == 0:
             assert one.number == 1
         else:
@@ -446,7 +446,7 @@ def test_a_write_with_an_end_is_not_open(tmp_path: Path, end: AuditAction) -> No
 def test_no_number_that_is_not_finite_gets_in(tmp_path: Path) -> None:
     path = tmp_path / "a"
     with pytest.raises(ValueError, match="JSON"):
-        _append(path, AuditAction.PROPOSED, "", {"gain": math.nan})
+        _append(path, AuditAction.PROPOSED, "", {"gain": math.nan}, who="")
     assert path.read_bytes() == b""
 
 
@@ -542,7 +542,7 @@ def test_details_of_another_program_are_no_error(tmp_path: Path, strange: object
     path = tmp_path / "a"
     foreign_details = {"sha256_before": strange, "sha256_after": strange, "begun": strange}
     for action in (AuditAction.APPLY_BEGUN, AuditAction.APPLIED, AuditAction.APPLY_BEGUN):
-        _append(path, action, "x", foreign_details)
+        _append(path, action, "x", foreign_details, who="")
     verdict = verify(path)
     assert verdict.holds
     assert len(verdict.open_writes) == 2
@@ -559,7 +559,7 @@ def test_an_entry_that_the_system_takes_in_parts_is_written_whole(
         return write(descriptor, part)
 
     monkeypatch.setattr(os, "write", seven_bytes)
-    made = _append(path, AuditAction.PROPOSED, "cell", {"n": 1})
+    made = _append(path, AuditAction.PROPOSED, "cell", {"n": 1}, who="me")
     monkeypatch.undo()
     assert read(path) == (made,)
     assert verify(path).holds
@@ -570,7 +570,7 @@ def test_an_entry_that_is_taken_in_part_fails_with_the_cause_of_the_rest(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int
 ) -> None:
     path = tmp_path / "audit.jsonl"
-    first = _append(path, AuditAction.PROPOSED, "cell", {"n": 1})
+    first = _append(path, AuditAction.PROPOSED, "cell", {"n": 1}, who="me")
     write = os.write
     calls: list[int] = []
 
@@ -583,11 +583,11 @@ def test_an_entry_that_is_taken_in_part_fails_with_the_cause_of_the_rest(
 
     monkeypatch.setattr(os, "write", short)
     with pytest.raises(OSError, match=os.strerror(number)) as caught:
-        _append(path, AuditAction.WRITE_FOUND, "cell", {"n": 2})
+        _append(path, AuditAction.WRITE_FOUND, "cell", {"n": 2}, who="me")
     monkeypatch.undo()
     assert caught.value.errno == number
     # The unfinished line is reported by the next entry, and the chain holds.
-    _append(path, AuditAction.WRITE_FOUND, "cell", {"n": 2})
+    _append(path, AuditAction.WRITE_FOUND, "cell", {"n": 2}, who="me")
     entries = read(path)
     assert entries[0] == first
     actions = [one.action for one in entries[1:]]
