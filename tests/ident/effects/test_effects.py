@@ -220,7 +220,8 @@ def _claim_holds(effect: Effect, claim: Property, axis: int, seed: int) -> bool:
             scaled = _scaled(s, 1.0 + 1e-8)
             change = effect.columns(scaled, axis) - columns
             is_seen = bool(np.any(change))
-            holds = is_seen and _largest(change) <= 1e-8 * 100.0 * INTERVALS
+            largest_change = 1e-8 * 100.0 * INTERVALS
+            holds = is_seen and _largest(change) <= largest_change
     return holds
 
 
@@ -272,7 +273,8 @@ def test_columns_are_as_many_as_coefficients_and_belong_to_their_axes(effect: Ef
     signals = random_signals(5)
     columns = effect.columns(signals, 0)
     joints = _joints_of_columns(effect)
-    assert columns.shape == (*joints, len(effect.coefficients), SAMPLES)
+    count = len(effect.coefficients)
+    assert columns.shape == (*joints, count, SAMPLES)
     assert np.all(np.isfinite(columns))
 
     is_moving = np.ptp(columns, axis=-1) > 0
