@@ -23,31 +23,49 @@ IDENTIFIED = (33.9, 32.4, 24.2, -9.21, 16.3, 6.79)
 AXES = ("J1", "J2", "J3", "J4", "J5", "J6")
 RECORDED = datetime(2025, 1, 2, 2, 0, 0, tzinfo=UTC)
 KEYS = {axis: f"drives.{axis}.gain" for axis in AXES}
+NONE_MISSING = (0,) * len(AXES)  #: answers that each axis lacks
 
 
 def demo_calibration() -> Calibration:
     """Calibration of the demo cell, with the gains of the paper's Table 4 and σ of 0.4 %."""
-    relative_error = RelativeError((3.1, 2.8, 3.4, 4.0, 5.5, 4.9), 3.2)
-    holdout_error = RelativeError((3.2, 2.9, 3.5, 4.1, 5.6, 5.0), 3.3)
-    nameplate_holdout_error = RelativeError((4.2, 3.9, 4.5, 5.1, 6.6, 6.0), 4.3)
+    relative_error = RelativeError(
+        axes=(3.1, 2.8, 3.4, 4.0, 5.5, 4.9),
+        total=3.2,
+    )
+    holdout_error = RelativeError(
+        axes=(3.2, 2.9, 3.5, 4.1, 5.6, 5.0),
+        total=3.3,
+    )
+    nameplate_holdout_error = RelativeError(
+        axes=(4.2, 3.9, 4.5, 5.1, 6.6, 6.0),
+        total=4.3,
+    )
+    load_friction = _demo_load_friction()
+    standstill_rad_s = [0.03] * len(AXES)
+    conditioning: dict[str, Any] = {
+        "position_cutoff_hz": 40.0,
+        "standstill_rad_s": standstill_rad_s,
+    }
+    current_residual = (0.03, 0.05, 0.02, 0.02, 0.01, 0.01)
+    digest = "c" * 64
     return Calibration(
         cell="demo",
         method="ml",
         gains=_demo_gains(),
         parameters=_demo_parameters(),
-        effects=(_demo_load_friction(),),
+        effects=(load_friction,),
         relative_error_percent=relative_error,
         holdout_error_percent=holdout_error,
         condition=812.0,
         rows=14400,
-        filter={"position_cutoff_hz": 40.0, "standstill_rad_s": [0.03] * 6},
+        filter=conditioning,
         sources=_demo_sources(),
-        configuration_sha256="c" * 64,
+        configuration_sha256=digest,
         created="2025-01-02T03:04:05+00:00",
         software="drivegain 0.1.0",
         nameplate_holdout_error_percent=nameplate_holdout_error,
         recording_configuration_sha256=None,
-        current_residual=(0.03, 0.05, 0.02, 0.02, 0.01, 0.01),
+        current_residual=current_residual,
     )
 
 
@@ -80,32 +98,30 @@ def _demo_load_friction() -> AcceptedEffect:
 
 
 def _demo_sources() -> tuple[Source, ...]:
-    """A log without a payload, one with a disc, and one with the disc that is held out."""
+    """A log without a payload, one with a disc, and one of the disc for the holdout."""
     unloaded = Source(
         name="unloaded",
         sha256="a" * 64,
         role="fit",
         recording=demo_recording(),
     )
-    loaded = Source(
-        name="loaded",
-        sha256="b" * 64,
-        role="fit",
-        partial=False,
-        payload="disc",
-        mass_kg=4.59,
-        recording=demo_recording(entered_kg=4.592),
-    )
-    held_out = Source(
-        name="held-out",
-        sha256="d" * 64,
-        role="holdout",
-        partial=False,
-        payload="disc",
-        mass_kg=4.59,
-        recording=demo_recording(entered_kg=4.588),
-    )
+    loaded = _demo_source_of_disc("loaded", "b" * 64, "fit", entered_kg=4.592)
+    held_out = _demo_source_of_disc("held-out", "d" * 64, "holdout", entered_kg=4.588)
     return unloaded, loaded, held_out
+
+
+def _demo_source_of_disc(name: str, digest: str, role: str, entered_kg: float) -> Source:
+    """A log with the disc, with its mass as the scale has it."""
+    recording = demo_recording(entered_kg)
+    return Source(
+        name=name,
+        sha256=digest,
+        role=role,
+        partial=False,
+        payload="disc",
+        mass_kg=4.59,
+        recording=recording,
+    )
 
 
 def calibration_for(cell_file: Path, factor: float = 1.0, **changes: Any) -> Path:
@@ -116,15 +132,15 @@ def calibration_for(cell_file: Path, factor: float = 1.0, **changes: Any) -> Pat
     now = datetime.now(UTC)
     an_hour_ago = now - timedelta(hours=1)
     demo = recorded(demo_calibration(), an_hour_ago)
-    gains = tuple(replace(gain, value=gain.value * factor) for gain in demo.gains)
-    calibration = replace(
+    gains = [replace(gain, value=gain.value * factor) for gain in demo.gains]
+    of_cell = replace(
         demo,
         created=now.isoformat(),
         configuration_sha256=declared.digest,
         recording_configuration_sha256=declared.recording_digest,
-        gains=gains,
+        gains=tuple(gains),
     )
-    calibration = replace(calibration, **changes)
+    calibration = replace(of_cell, **changes)
     path = cell_file.parent / f"calibration-{factor:g}.yaml"
     save_calibration(calibration, path)
     return path
@@ -138,14 +154,15 @@ def demo_recording(entered_kg: float | None = None, at: datetime = RECORDED) -> 
         serials=_demo_serials(len(AXES)),
         saturated_percent=(0.0, 0.1, 0.0, 0.0, 1.9, 0.0),
         lost_cycles=0,
-        missing=(0,) * len(AXES),
+        missing=NONE_MISSING,
         controller_sha256=None,
     )
 
 
 def _demo_serials(count: int) -> tuple[int, ...]:
     """Serial numbers of so many amplifiers."""
-    return tuple(range(1001, 1001 + count))
+    numbers = range(1001, 1001 + count)
+    return tuple(numbers)
 
 
 def recorded(calibration: Calibration, at: datetime) -> Calibration:
@@ -162,20 +179,21 @@ def with_recordings(calibration: Calibration, **changes: Any) -> Calibration:
         recording = replace(source.recording, **changes)
         return replace(source, recording=recording)
 
-    sources = tuple(changed(source) for source in calibration.sources)
-    return replace(calibration, sources=sources)
+    sources = [changed(source) for source in calibration.sources]
+    return replace(calibration, sources=tuple(sources))
 
 
 def of_first_axes(calibration: Calibration, count: int) -> Calibration:
     """The same of so many axes."""
+    relative_error = _error_of_first_axes(calibration.relative_error_percent, count)
+    holdout_error = _optional_error(calibration.holdout_error_percent, count)
+    nameplate_holdout_error = _optional_error(calibration.nameplate_holdout_error_percent, count)
     cut = replace(
         calibration,
         gains=calibration.gains[:count],
-        relative_error_percent=_error_of_first_axes(calibration.relative_error_percent, count),
-        holdout_error_percent=_optional_error(calibration.holdout_error_percent, count),
-        nameplate_holdout_error_percent=_optional_error(
-            calibration.nameplate_holdout_error_percent, count
-        ),
+        relative_error_percent=relative_error,
+        holdout_error_percent=holdout_error,
+        nameplate_holdout_error_percent=nameplate_holdout_error,
     )
     return with_recordings(
         cut,
@@ -186,7 +204,8 @@ def of_first_axes(calibration: Calibration, count: int) -> Calibration:
 
 
 def _error_of_first_axes(error: RelativeError, count: int) -> RelativeError:
-    return replace(error, axes=error.axes[:count])
+    axes = error.axes[:count]
+    return replace(error, axes=axes)
 
 
 def _optional_error(error: RelativeError | None, count: int) -> RelativeError | None:
@@ -197,7 +216,8 @@ def _optional_error(error: RelativeError | None, count: int) -> RelativeError | 
 
 def _tuples(entries: st.SearchStrategy[Any], max_size: int) -> st.SearchStrategy[tuple[Any, ...]]:
     """Tuples of no entry up to so many."""
-    return st.lists(entries, max_size=max_size).map(tuple)
+    lists = st.lists(entries, max_size=max_size)
+    return lists.map(tuple)
 
 
 _numbers = st.floats(-1e30, 1e30)
@@ -211,16 +231,19 @@ _optional_texts = st.none() | _texts
 _gains = st.builds(Gain, _texts, _numbers, _deviations, _texts, _numbers)
 _parameters = st.builds(Parameter, _texts, _numbers, _deviations, _texts)
 _errors = st.builds(RelativeError, _tuples(_deviations, 3), _deviations)
+_optional_errors = st.none() | _errors
+_optional_serials = st.none() | _serials
 _recordings = st.builds(
     Recording,
     recorded_s=_optional_numbers,
     entered_kg=_optional_numbers,
-    serials=_tuples(st.none() | _serials, 3),
+    serials=_tuples(_optional_serials, 3),
     saturated_percent=_tuples(_percents, 3),
     lost_cycles=_counts,
     missing=_tuples(_counts, 3),
     controller_sha256=_optional_texts,
 )
+_optional_recordings = st.none() | _recordings
 _sources = st.builds(
     Source,
     name=_texts,
@@ -229,39 +252,44 @@ _sources = st.builds(
     partial=st.booleans(),
     payload=_optional_texts,
     mass_kg=_optional_numbers,
-    recording=st.none() | _recordings,
+    recording=_optional_recordings,
 )
+_settings = st.dictionaries(_texts, _numbers, max_size=3)
 _effects = st.builds(
     AcceptedEffect,
     name=_texts,
     axis=_texts,
-    settings=st.dictionaries(_texts, _numbers, max_size=3),
+    settings=_settings,
     coefficients=_tuples(_parameters, 2),
     error_before_percent=_deviations,
     error_after_percent=_deviations,
     ambiguity=_tuples(_texts, 2),
 )
+_methods = st.sampled_from(("ls", "wls", "tls", "ml"))
 _covariance_factors = st.tuples(_tuples(_numbers, 3))
 """Factors of one row."""
+_optional_factors = st.none() | _covariance_factors
 _filter_values = _numbers | st.lists(_numbers, max_size=3)
+_filters = st.dictionaries(_texts, _filter_values, max_size=3)
+_optional_residuals = st.none() | _tuples(_deviations, 3)
 calibrations = st.builds(
     Calibration,
     cell=_texts,
-    method=st.sampled_from(("ls", "wls", "tls", "ml")),
+    method=_methods,
     gains=_tuples(_gains, 4),
     parameters=_tuples(_parameters, 4),
     effects=_tuples(_effects, 2),
-    covariance_factor=st.none() | _covariance_factors,
+    covariance_factor=_optional_factors,
     relative_error_percent=_errors,
-    holdout_error_percent=st.none() | _errors,
+    holdout_error_percent=_optional_errors,
     condition=_deviations,
     rows=_counts,
-    filter=st.dictionaries(_texts, _filter_values, max_size=3),
+    filter=_filters,
     sources=_tuples(_sources, 2),
     configuration_sha256=_texts,
     created=_texts,
     software=_texts,
-    nameplate_holdout_error_percent=st.none() | _errors,
+    nameplate_holdout_error_percent=_optional_errors,
     recording_configuration_sha256=_optional_texts,
-    current_residual=st.none() | _tuples(_deviations, 3),
+    current_residual=_optional_residuals,
 )

@@ -261,11 +261,10 @@ class _Tracer:
         number = len(self.calls)
         self.calls.append(call)
         fault = self.fault
-        if (
-            fault is None
-            or number < fault.number
-            or (number > fault.number and not fault.is_lasting)
-        ):
+        if fault is None or number < fault.number:
+            return
+        is_later = number > fault.number
+        if is_later and not fault.is_lasting:
             return
         if fault.length:
             self._shorten(registers, fault.length)
@@ -291,8 +290,10 @@ class _Tracer:
         kind = CALLS.get(registers[_ORIG_RAX])
         if kind is None:
             return None
-        if kind.flags is not None and not registers[kind.flags] & _WRITING:
-            return None
+        if kind.flags is not None:
+            flags = registers[kind.flags]
+            if not flags & _WRITING:
+                return None
         path = self._path_of(kind, registers)
         if path is None or not self.is_counted(path):
             return None
@@ -306,10 +307,11 @@ class _Tracer:
         if kind.name == "send":
             return SOCKET
         if kind.file is not None:
-            descriptor = registers[kind.file]
-            if kind.name == "close" and not _is_for_writing(process / "fdinfo" / str(descriptor)):
+            descriptor = str(registers[kind.file])
+            info = process / "fdinfo" / descriptor
+            if kind.name == "close" and not _is_for_writing(info):
                 return None
-            return _link(process / "fd" / str(descriptor))
+            return _link(process / "fd" / descriptor)
         assert kind.path is not None
         if registers[kind.path] == 0:  # of the descriptor itself, as utimensat(2) has it
             return None
@@ -318,9 +320,9 @@ class _Tracer:
         path = Path(_text(memory, address))
         folder = process / "cwd"
         if kind.folder is not None:
-            descriptor = ctypes.c_int(registers[kind.folder]).value
-            if descriptor != _AT_CWD:
-                folder = process / "fd" / str(descriptor)
+            number = ctypes.c_int(registers[kind.folder]).value
+            if number != _AT_CWD:
+                folder = process / "fd" / str(number)
         if path.is_absolute():
             return path
         return (_link(folder) or Path("/")) / path
@@ -331,8 +333,10 @@ def _is_for_writing(info: Path) -> bool:
         lines = info.read_text().splitlines()
     except OSError:
         return False
-    flags = next(line for line in lines if line.startswith("flags:"))
-    return bool(int(flags.split()[1], 8) & (os.O_WRONLY | os.O_RDWR))
+    of_flags = next(line for line in lines if line.startswith("flags:"))
+    _, digits = of_flags.split()
+    flags = int(digits, 8)
+    return bool(flags & (os.O_WRONLY | os.O_RDWR))
 
 
 def _link(path: Path) -> Path | None:
@@ -341,7 +345,9 @@ def _link(path: Path) -> Path | None:
         target = path.readlink()
     except OSError:
         return None
-    return target if target.is_absolute() else None
+    if target.is_absolute():
+        return target
+    return None
 
 
 def _text(memory: Path, address: int) -> str:
@@ -350,5 +356,7 @@ def _text(memory: Path, address: int) -> str:
         content = b""
         while b"\0" not in content and len(content) < 4096:
             # Not beyond the page: the next one may not be there.
-            content += stream.read(4096 - (address + len(content)) % 4096)
-    return os.fsdecode(content.partition(b"\0")[0])
+            place = address + len(content)
+            content += stream.read(4096 - place % 4096)
+    text, _, _ = content.partition(b"\0")
+    return os.fsdecode(text)

@@ -33,54 +33,97 @@ def _stand_in(kind: type) -> Any:
 
 def _right_arguments() -> dict[str, dict[str, Any]]:
     """Arguments of the right type for each public function."""
-    target = daq.FileTarget(Path("controller.yaml"))
-    cell = daq.load_cell(CHECKOUT / "configs/cells/demo.yaml")
+    controller_file = Path("controller.yaml")
+    target = daq.FileTarget(controller_file)
+    cell_file = CHECKOUT / "configs/cells/demo.yaml"
+    cell = daq.load_cell(cell_file)
+    log = Path("run.mcap")
     logs = [Path("bare.mcap")]
-    return {
-        "load_cell": {"path": Path("cell.yaml")},
-        "load_run": {"path": Path("run.mcap"), "cell": cell, "lossy": daq.LossyLogs.REFUSED},
-        "read_log": {"path": Path("run.mcap")},
-        "load_calibration": {"path": Path("calibration.yaml"), "own_effects": ()},
-        "save_calibration": {"calibration": CALIBRATION, "path": Path("calibration.yaml")},
-        "fit_logs": {
-            "logs": logs,
-            "holdout": logs,
-            "cell": cell,
-            "created": NOW,
-            "own_effects": (),
-        },
-        "fit": {"logs": logs, "holdout": logs, "cell": cell, "gains_fixed": False},
-        "close_loop": {"start": _stand_in(daq.Fit), "seed": 0},
-        "calibration_of": {"fitted": _stand_in(daq.Fit), "created": NOW},
-        "validate": {"calibration": CALIBRATION, "logs": logs, "cell": cell},
-        "propose": {"target": target, "request": daq.Request(CALIBRATION, NOW)},
-        "apply": {
-            "proposal": _stand_in(daq.Proposal),
-            "now": NOW,
-            "audit": Path("audit.jsonl"),
-            "who": "Ada",
-        },
-        "rollback": {
-            "target": target,
-            "now": NOW,
-            "audit": Path("audit.jsonl"),
-            "who": "Ada",
-            "planned": _stand_in(Edit),
-        },
+    calibration_file = Path("calibration.yaml")
+    fitted = _stand_in(daq.Fit)
+    proposal = _stand_in(daq.Proposal)
+    planned = _stand_in(Edit)
+    request = daq.Request(CALIBRATION, NOW)
+    of_fit = {
+        "logs": logs,
+        "holdout": logs,
+        "cell": cell,
     }
+    audit = Path("audit.jsonl")
+    of_write = {
+        "now": NOW,
+        "audit": audit,
+        "who": "Ada",
+    }
+
+    right: dict[str, dict[str, Any]] = {}
+    right["load_cell"] = {"path": Path("cell.yaml")}
+    right["load_run"] = {
+        "path": log,
+        "cell": cell,
+        "lossy": daq.LossyLogs.REFUSED,
+    }
+    right["read_log"] = {"path": log}
+    right["load_calibration"] = {
+        "path": calibration_file,
+        "own_effects": (),
+    }
+    right["save_calibration"] = {
+        "calibration": CALIBRATION,
+        "path": calibration_file,
+    }
+    right["fit_logs"] = {
+        **of_fit,
+        "created": NOW,
+        "own_effects": (),
+    }
+    right["fit"] = {**of_fit, "gains_fixed": False}
+    right["close_loop"] = {"start": fitted, "seed": 0}
+    right["calibration_of"] = {
+        "fitted": fitted,
+        "created": NOW,
+    }
+    right["validate"] = {
+        "calibration": CALIBRATION,
+        "logs": logs,
+        "cell": cell,
+    }
+    right["propose"] = {
+        "target": target,
+        "request": request,
+    }
+    right["apply"] = {
+        "proposal": proposal,
+        **of_write,
+    }
+    right["rollback"] = {
+        "target": target,
+        **of_write,
+        "planned": planned,
+    }
+    return right
 
 
 RIGHT = _right_arguments()
 
 
+def _call(function: str, **changes: Any) -> Any:
+    """Call a public function with right arguments but these."""
+    arguments = {**RIGHT[function], **changes}
+    public = getattr(lax, function)
+    return public(**arguments)
+
+
 def _cases() -> list[tuple[str, str]]:
     found = []
     for function, arguments in RIGHT.items():
-        found += [(function, name) for name in arguments]
+        for name in arguments:
+            found.append((function, name))
     return found
 
 
 CASES = _cases()
+WITHOUT_ZONE = datetime(2026, 3, 1)
 WRONG: tuple[Any, ...] = (
     3.5,
     -1,
@@ -89,16 +132,18 @@ WRONG: tuple[Any, ...] = (
     object(),
     {"a": 1},
     ["x", 3],
-    datetime(2026, 3, 1),
+    WITHOUT_ZONE,
 )
 TEXTS = {"path", "audit", "who"}  #: Arguments that a text is right for
 
 
 def test_every_public_function_is_looked_at() -> None:
-    functions = {name for name in daq.__all__ if inspect.isfunction(getattr(daq, name))}
+    public = {name: getattr(daq, name) for name in daq.__all__}
+    functions = {name for name, value in public.items() if inspect.isfunction(value)}
     assert functions == set(RIGHT)
     for name, arguments in RIGHT.items():
-        parameters = inspect.signature(getattr(daq, name)).parameters.values()
+        signature = inspect.signature(public[name])
+        parameters = signature.parameters.values()
         needed = {one.name for one in parameters if one.default is one.empty}
         assert needed <= set(arguments), name
 
@@ -109,17 +154,22 @@ def test_an_argument_of_another_type_is_refused_by_name(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     for value in WRONG:
-        if isinstance(value, str) and name in TEXTS:
+        is_text = isinstance(value, str)
+        if is_text and name in TEXTS:
             continue
-        if isinstance(value, list) and name == "own_effects":
-            continue  # what an effect lacks is said by `EffectRefused`
+        # What an effect lacks is said by `EffectRefused`.
+        is_list = isinstance(value, list)
+        if is_list and name == "own_effects":
+            continue
         with pytest.raises(daq.UsageError) as caught:
-            getattr(lax, function)(**{**RIGHT[function], name: value})
-        expected = f"{name} of {function}"
-        assert caught.value.subject == expected
-        assert f"of type {type(value).__name__}" in caught.value.found
-        assert caught.value.expected
-    assert list(tmp_path.iterdir()) == []
+            _call(function, **{name: value})
+        error = caught.value
+        assert error.subject == f"{name} of {function}"
+        type_name = type(value).__name__
+        assert f"of type {type_name}" in error.found
+        assert error.expected
+    files = list(tmp_path.iterdir())
+    assert files == []
 
 
 @pytest.mark.parametrize(
@@ -128,11 +178,10 @@ def test_an_argument_of_another_type_is_refused_by_name(
 def test_a_folder_or_no_name_in_the_place_of_a_file_is_refused(
     function: str, tmp_path: Path
 ) -> None:
-    arguments = {**RIGHT[function], "path": tmp_path}
     with pytest.raises(daq.DaqError, match=str(tmp_path)):
-        getattr(lax, function)(**arguments)
+        _call(function, path=tmp_path)
     with pytest.raises(daq.UsageError, match="expected the path of a file"):
-        getattr(lax, function)(**{**arguments, "path": ""})
+        _call(function, path="")
 
 
 @pytest.mark.parametrize("function", ["fit", "fit_logs", "validate"])
@@ -140,23 +189,22 @@ def test_one_log_in_the_place_of_a_list_is_named_with_the_list(function: str) ->
     for log in ("bare.mcap", Path("bare.mcap")):
         with pytest.raises(
             daq.UsageError,
-            match=rf"logs of {function}: found .*give a list: "
-            r"\[bare, loaded\]",
+            match=rf"logs of {function}: found .*give a list: \[bare, loaded\]",
         ):
-            getattr(lax, function)(**{**RIGHT[function], "logs": log})
+            _call(function, logs=log)
 
 
 def test_no_list_is_too_little_checked() -> None:
     with pytest.raises(
         daq.UsageError,
-        match=r"holdout of fit_logs: .*expected a list of paths, "
-        r"each as Path or text",
+        match=r"holdout of fit_logs: .*expected a list of paths, each as Path or text",
     ):
         lax.fit_logs(["bare.mcap"], holdout=[3])
+    fitted = RIGHT["close_loop"]["start"]
     with pytest.raises(
         daq.UsageError, match="seed of close_loop: found True of type bool; expected a whole number"
     ):
-        lax.close_loop(RIGHT["close_loop"]["start"], True)
+        lax.close_loop(fitted, True)
 
 
 @pytest.mark.parametrize(
@@ -177,8 +225,19 @@ def test_no_list_is_too_little_checked() -> None:
 )
 def test_a_request_of_other_things_is_refused(calibration: Any, now: Any, words: str) -> None:
     target = RIGHT["propose"]["target"]
+    request = daq.Request(calibration, now)
     with pytest.raises(daq.UsageError, match=words):
-        lax.propose(target, daq.Request(calibration, now))
+        lax.propose(target, request)
+
+
+def _fields(kind: type) -> set[str]:
+    """Names of the fields of a dataclass."""
+    return {one.name for one in dataclasses.fields(kind)}
+
+
+def _names(cases: tuple[tuple[str, Any, str], ...]) -> set[str]:
+    """Names of the fields that cases have wrong."""
+    return {name for name, _, _ in cases}
 
 
 OTHER_FIELDS = (
@@ -198,12 +257,13 @@ def test_a_field_of_a_request_of_another_type_is_named(
     name: str, value: Any, expected: str
 ) -> None:
     request = daq.Request(CALIBRATION, NOW, **{name: value})
+    target = RIGHT["propose"]["target"]
     with pytest.raises(daq.UsageError) as caught:
-        daq.propose(RIGHT["propose"]["target"], request)
+        daq.propose(target, request)
     assert caught.value.subject == f"{name} of the request"
     assert caught.value.expected == expected
-    fields = {one.name for one in dataclasses.fields(daq.Request)}
-    assert {name for name, *_ in OTHER_FIELDS} | {"calibration", "now"} == fields
+    required = {"calibration", "now"}
+    assert _names(OTHER_FIELDS) | required == _fields(daq.Request)
 
 
 FILE_FIELDS = (
@@ -222,15 +282,16 @@ DRIVE_FIELDS = (
 
 
 def _target_with(kind: type, right: dict[str, Any], name: str, value: Any) -> Any:
-    assert {one.name for one in dataclasses.fields(kind)} == right.keys()
-    return kind(**{**right, name: value})
+    assert _fields(kind) == right.keys()
+    arguments = {**right, name: value}
+    return kind(**arguments)
 
 
 @pytest.mark.parametrize(("name", "value", "expected"), FILE_FIELDS)
 def test_a_field_of_a_file_target_of_another_type_is_named(
     name: str, value: Any, expected: str, tmp_path: Path
 ) -> None:
-    assert {name for name, *_ in FILE_FIELDS} == RIGHT_FILE.keys()
+    assert _names(FILE_FIELDS) == RIGHT_FILE.keys()
     target = _target_with(daq.FileTarget, RIGHT_FILE, name, value)
     _refuse(target, name, expected, "FileTarget")
 
@@ -245,7 +306,7 @@ def test_a_field_of_a_drive_target_of_another_type_is_named(
         "network": _stand_in(CanopenNetwork),
         "saving": Saving.KNOWN,
     }
-    assert {name for name, *_ in DRIVE_FIELDS} == right.keys()
+    assert _names(DRIVE_FIELDS) == right.keys()
     target = _target_with(daq.DriveTarget, right, name, value)
     _refuse(target, name, expected, "DriveTarget")
 
@@ -262,24 +323,29 @@ RIGHT_FILE: dict[str, Any] = {
 def _refuse(target: Any, name: str, expected: str, kind: str) -> None:
     """Neither a proposal nor a rollback takes the target."""
     request = daq.Request(CALIBRATION, NOW)
-    for call in (lambda: daq.propose(target, request), lambda: daq.rollback(target, NOW)):
-        with pytest.raises(daq.UsageError) as caught:
-            call()
+    with pytest.raises(daq.UsageError) as by_proposal:
+        daq.propose(target, request)
+    with pytest.raises(daq.UsageError) as by_rollback:
+        daq.rollback(target, NOW)
+    for caught in (by_proposal, by_rollback):
         assert caught.value.subject == f"{name} of the {kind}"
         assert caught.value.expected == expected
 
 
 def test_the_file_target_of_something_else_than_a_cell_is_refused() -> None:
     cell = RIGHT["fit"]["cell"]
-    for arguments, name in ((("cell.yaml",), "cell"), ((cell, 3), "file")):
-        with pytest.raises(daq.UsageError) as caught:
-            lax.FileTarget.of(*arguments)
-        assert caught.value.subject == f"{name} of FileTarget.of"
-    file = lax.FileTarget.of(cell, "other.yaml").file
-    assert file == Path("other.yaml")
+    with pytest.raises(daq.UsageError) as of_text:
+        lax.FileTarget.of("cell.yaml")
+    assert of_text.value.subject == "cell of FileTarget.of"
+    with pytest.raises(daq.UsageError) as of_number:
+        lax.FileTarget.of(cell, 3)
+    assert of_number.value.subject == "file of FileTarget.of"
+    target = lax.FileTarget.of(cell, "other.yaml")
+    assert target.file == Path("other.yaml")
 
 
 def test_paths_may_be_texts(tmp_path: Path) -> None:
     file = str(tmp_path / "calibration.yaml")
     daq.save_calibration(CALIBRATION, file)
-    assert daq.load_calibration(file).gains == CALIBRATION.gains
+    loaded = daq.load_calibration(file)
+    assert loaded.gains == CALIBRATION.gains

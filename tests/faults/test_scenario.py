@@ -7,6 +7,8 @@ from __future__ import annotations
 import json
 import re
 import socket
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
@@ -41,54 +43,78 @@ moves:
 """
 
 
+CELL_FILE = CONFIGS / "cells" / "demo.yaml"
+
+
 def scenario(folder: Path, faults: str) -> Path:
     """A simulation file of the demo cell with these faults."""
-    text = (CONFIGS / "simulation" / "clean.yaml").read_text(encoding="utf-8")
+    clean = CONFIGS / "simulation" / "clean.yaml"
+    text = clean.read_text(encoding="utf-8")
+    text = text.replace("urdf: ", f"urdf: {CONFIGS}/simulation/")
     path = folder / "scenario.yaml"
-    path.write_text(
-        text.replace("urdf: ", f"urdf: {CONFIGS}/simulation/") + f"faults:\n{faults}",
-        encoding="utf-8",
-    )
+    path.write_text(f"{text}faults:\n{faults}", encoding="utf-8")
     return path
+
+
+def faulty_cell(folder: Path, faults: str) -> CellSpec:
+    """The demo cell with these faults."""
+    path = scenario(folder, faults)
+    return load_simulation(path)
+
+
+@contextmanager
+def simulated(spec: CellSpec) -> Iterator[SimulatedCell]:
+    """Run a cell on the bus of the demo cell."""
+    address = bus_address(load_cell(CELL_FILE))
+    with open_bus(address) as bus, SimulatedCell(spec, bus) as cell:
+        yield cell
+
+
+def record_command(folder: Path) -> list[str]:
+    """Write a plan; return the arguments that record it to `a.mcap`, without leave to move."""
+    plan = folder / "plan.yaml"
+    plan.write_text(PLAN, encoding="utf-8")
+    out = folder / "a.mcap"
+    return [
+        "record",
+        str(CELL_FILE),
+        str(plan),
+        "--out",
+        str(out),
+    ]
 
 
 @pytest.mark.slow
 def test_a_fault_of_a_scenario_ends_a_recording_with_exit_code_5_and_is_in_its_log(
     tmp_path: Path,
 ) -> None:
-    spec = load_simulation(
-        scenario(tmp_path, "  - {fault: emergency, axis: J3, at_s: 0.2, emcy_code: 0x2310}\n")
-    )
-    cell_file = CONFIGS / "cells" / "demo.yaml"
-    plan = tmp_path / "plan.yaml"
+    fault = "  - {fault: emergency, axis: J3, at_s: 0.2, emcy_code: 0x2310}\n"
+    spec = faulty_cell(tmp_path, fault)
+    command = record_command(tmp_path)
+
+    with simulated(spec) as cell:
+        code = main([*command, "--enable-motion", "--operator", "test"])
+        drives = [node.drive for node in cell.nodes]
+        in_fault = [drive for drive in drives if drive.state == PowerState.FAULT]
+        powered = [drive for drive in drives if drive.powered]
+
+    assert code == ExitCode.DEVICE_FAULT
+    assert len(in_fault) <= 1
+    assert powered == []
     out = tmp_path / "a.mcap"
-    plan.write_text(PLAN, encoding="utf-8")
-    with open_bus(bus_address(load_cell(cell_file))) as bus, SimulatedCell(spec, bus) as cell:
-        code = main(
-            [
-                "record",
-                str(cell_file),
-                str(plan),
-                "--out",
-                str(out),
-                "--enable-motion",
-                "--operator",
-                "test",
-            ]
-        )
-        assert code == ExitCode.DEVICE_FAULT
-        assert [node.drive.state for node in cell.nodes].count(PowerState.FAULT) <= 1
-        assert not any(node.drive.powered for node in cell.nodes)
     assert not out.exists()
+    part = tmp_path / "a.mcap.part"
     saved = tmp_path / "saved.mcap"
-    assert main(["salvage", str(tmp_path / "a.mcap.part"), "--out", str(saved)]) == ExitCode.OK
-    statistics = [
-        event for event in read_log(saved).events if event.kind in (EventKind.EMCY, EventKind.STOP)
-    ]
-    assert [(event.kind, event.axis, event.code) for event in statistics[:1]] == [
-        (EventKind.EMCY, 2, 0x2310)
-    ]
-    assert EventKind.STOP in {event.kind for event in statistics}
+    salvage = ["salvage", str(part), "--out", str(saved)]
+    assert main(salvage) == ExitCode.OK
+    events = read_log(saved).events
+    emcy_and_stop = [one for one in events if one.kind in (EventKind.EMCY, EventKind.STOP)]
+    first = emcy_and_stop[0]
+    assert first.kind == EventKind.EMCY
+    assert first.axis == 2
+    assert first.code == 0x2310
+    kinds = {event.kind for event in emcy_and_stop}
+    assert EventKind.STOP in kinds
 
 
 class WatchedFeed(Feed):
@@ -115,6 +141,22 @@ def end_at_the_console() -> ProgramEnd:
                 return message.end
 
 
+def setup_failure(capsys: pytest.CaptureFixture[str]) -> dict[str, str]:
+    """The error that a refused set-up printed last, as a JSON document."""
+    lines = capsys.readouterr().err.splitlines()
+    failure: dict[str, str] = json.loads(lines[-1])
+    assert failure["kind"] == "SetupRefused"
+    return failure
+
+
+def check_console_and_folder(failure: dict[str, str], folder: Path) -> None:
+    """Check that a console received the error, and that the recording left no file."""
+    text = f"{failure['found']}; expected {failure['expected']}; {failure['do']}"
+    assert end_at_the_console() == ProgramEnd(ok=False, axes_stopped=True, text=text)
+    logs = list(folder.glob("*.mcap*"))
+    assert logs == []
+
+
 def test_a_drive_that_refuses_its_mapping_ends_a_recording_with_its_error_and_consoles_get_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -122,33 +164,22 @@ def test_a_drive_that_refuses_its_mapping_ends_a_recording_with_its_error_and_co
     and cannot be compared with other errors.
     """
     monkeypatch.setattr("daq.log.feed.Feed", WatchedFeed)
-    spec = load_simulation(scenario(tmp_path, "  - {fault: refuses-mapping, axis: J2}\n"))
-    cell_file = CONFIGS / "cells" / "demo.yaml"
-    plan = tmp_path / "plan.yaml"
-    out = tmp_path / "a.mcap"
-    plan.write_text(PLAN, encoding="utf-8")
-    with open_bus(bus_address(load_cell(cell_file))) as bus, SimulatedCell(spec, bus) as cell:
-        command = [
-            "record",
-            str(cell_file),
-            str(plan),
-            "--out",
-            str(out),
-            "--enable-motion",
-            "--json",
-        ]
-        assert main(command) == ExitCode.DEVICE_FAULT
-        assert {node.drive.state for node in cell.nodes} == {PowerState.SWITCH_ON_DISABLED}
-    failure = json.loads(capsys.readouterr().err.splitlines()[-1])
-    assert failure["kind"] == "SetupRefused"
+    spec = faulty_cell(tmp_path, "  - {fault: refuses-mapping, axis: J2}\n")
+    command = record_command(tmp_path)
+
+    with simulated(spec) as cell:
+        code = main([*command, "--enable-motion", "--json"])
+        states = {node.drive.state for node in cell.nodes}
+
+    assert code == ExitCode.DEVICE_FAULT
+    assert states == {PowerState.SWITCH_ON_DISABLED}
+    failure = setup_failure(capsys)
     assert failure["found"].startswith(
         "J2 (node 2): TPDO1: writing 0x0 to 1A00h:00: aborted, Code 0x06010002"
     )
     assert failure["expected"] == "a PDO that can be mapped for the recording"
     assert "switch the drive off and on" in failure["do"]
-    told = f"{failure['found']}; expected {failure['expected']}; {failure['do']}"
-    assert end_at_the_console() == ProgramEnd(ok=False, axes_stopped=True, text=told)
-    assert not list(tmp_path.glob("*.mcap*"))
+    check_console_and_folder(failure, tmp_path)
 
 
 def refuse(
@@ -158,10 +189,10 @@ def refuse(
     server = cell.nodes[1]._sdo
     sound = getattr(server, action)
 
-    def aborting(asked: int, asked_sub: int, *value: bytes) -> object:
-        if (asked, asked_sub) == (index, sub):
+    def aborting(read_index: int, read_sub: int, *value: bytes) -> object:
+        if (read_index, read_sub) == (index, sub):
             raise SdoAbort(0x08000022)
-        return sound(asked, asked_sub, *value)
+        return sound(read_index, read_sub, *value)
 
     monkeypatch.setattr(server, action, aborting)
 
@@ -203,46 +234,27 @@ def test_an_abort_at_each_step_of_the_setup_is_exit_5_with_its_reason_and_consol
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setattr("daq.log.feed.Feed", WatchedFeed)
-    cell_file = CONFIGS / "cells" / "demo.yaml"
-    plan = tmp_path / "plan.yaml"
-    out = tmp_path / "a.mcap"
-    plan.write_text(PLAN, encoding="utf-8")
+    command = record_command(tmp_path)
     spec = load_simulation(shipped_simulation("clean"))
-    with open_bus(bus_address(load_cell(cell_file))) as bus, SimulatedCell(spec, bus) as cell:
+
+    with simulated(spec) as cell:
         refuse(monkeypatch, cell, action, index, sub)
-        command = [
-            "record",
-            str(cell_file),
-            str(plan),
-            "--out",
-            str(out),
-            "--enable-motion",
-            "--json",
-        ]
-        assert main(command) == ExitCode.DEVICE_FAULT
-        assert {node.drive.state for node in cell.nodes} == {PowerState.SWITCH_ON_DISABLED}
-    failure = json.loads(capsys.readouterr().err.splitlines()[-1])
-    assert failure["kind"] == "SetupRefused"
+        code = main([*command, "--enable-motion", "--json"])
+        states = {node.drive.state for node in cell.nodes}
+
+    assert code == ExitCode.DEVICE_FAULT
+    assert states == {PowerState.SWITCH_ON_DISABLED}
+    failure = setup_failure(capsys)
     assert failure["found"].startswith("J2 (node 2): ")
     assert f"{index:04X}h:{sub:02X}" in failure["found"]
     assert said in failure["found"] + failure["expected"]
     assert failure["do"]
-    told = f"{failure['found']}; expected {failure['expected']}; {failure['do']}"
-    assert end_at_the_console() == ProgramEnd(ok=False, axes_stopped=True, text=told)
-    assert not list(tmp_path.glob("*.mcap*"))
+    check_console_and_folder(failure, tmp_path)
 
 
 def test_without_leave_nothing_is_sent_to_the_cell(tmp_path: Path) -> None:
-    plan = tmp_path / "plan.yaml"
-    plan.write_text(PLAN, encoding="utf-8")
-    arguments = [
-        "record",
-        str(CONFIGS / "cells" / "demo.yaml"),
-        str(plan),
-        "--out",
-        str(tmp_path / "a.mcap"),
-    ]
-    assert main(arguments) == ExitCode.USAGE
+    command = record_command(tmp_path)
+    assert main(command) == ExitCode.USAGE
 
 
 def test_times_of_a_scenario_become_syncs(tmp_path: Path) -> None:
@@ -251,10 +263,21 @@ def test_times_of_a_scenario_become_syncs(tmp_path: Path) -> None:
         "  - {fault: lost, axis: 2, at_s: 1.5, for_s: 0.002}\n"
         "  - {fault: emergency, axis: J3, at_cycle: 7, emcy_code: 0x2310}\n"
     )
-    assert load_simulation(scenario(tmp_path, faults)).faults == (
-        FaultSpec(FaultKind.SILENT),
-        FaultSpec(FaultKind.LOST, 1, 1500, 2),
-        FaultSpec(FaultKind.EMERGENCY, 2, 7, None, 0x2310),
+    spec = faulty_cell(tmp_path, faults)
+    silent, lost, emergency = spec.faults
+    assert silent == FaultSpec(FaultKind.SILENT)
+    assert lost == FaultSpec(
+        FaultKind.LOST,
+        axis=1,
+        at_cycle=1500,
+        cycles=2,
+    )
+    assert emergency == FaultSpec(
+        FaultKind.EMERGENCY,
+        axis=2,
+        at_cycle=7,
+        cycles=None,
+        value=0x2310,
     )
 
 
@@ -269,13 +292,15 @@ def test_times_of_a_scenario_become_syncs(tmp_path: Path) -> None:
     ],
 )
 def test_a_scenario_that_means_nothing_is_refused(tmp_path: Path, fault: str) -> None:
+    path = scenario(tmp_path, f"  - {fault}\n")
     with pytest.raises(SchemaMismatch):
-        load_simulation(scenario(tmp_path, f"  - {fault}\n"))
+        load_simulation(path)
 
 
 def test_a_scenario_for_an_axis_that_the_cell_lacks_is_refused(tmp_path: Path) -> None:
+    path = scenario(tmp_path, "  - {fault: lost, axis: J7}\n")
     with pytest.raises(ConfigurationInconsistent, match="J7"):
-        load_simulation(scenario(tmp_path, "  - {fault: lost, axis: J7}\n"))
+        load_simulation(path)
 
 
 # -- a scenario file of faults alone
@@ -310,25 +335,45 @@ def test_the_faults_of_a_scenario_file_come_on_top_of_those_of_the_simulation(
         "--faults",
     ]
     assert main([*arguments, str(faults)]) == ExitCode.OK
-    assert built[0].faults == (
-        FaultSpec(FaultKind.LOST, 1, 7),
-        FaultSpec(FaultKind.LIMIT, 1, 1500),
-        FaultSpec(FaultKind.SILENT),
+    own = FaultSpec(
+        FaultKind.LOST,
+        axis=1,
+        at_cycle=7,
     )
+    limit = FaultSpec(
+        FaultKind.LIMIT,
+        axis=1,
+        at_cycle=1500,
+    )
+    silent = FaultSpec(FaultKind.SILENT)
+    assert built[0].faults == (own, limit, silent)
     assert "3 faults" in capsys.readouterr().out
+
     assert main([*arguments, "faults-example"]) == ExitCode.OK
-    assert built[1].faults == built[0].faults[:1] + load_scenario(
-        shipped_simulation("faults-example"), 6, 1000
-    )
+    example = load_scenario(shipped_simulation("faults-example"), 6, 1000)
+    assert built[1].faults == (own, *example)
 
 
 def test_the_example_names_every_kind_of_fault() -> None:
-    text = shipped_simulation("faults-example").read_text(encoding="utf-8")
-    words = set(re.findall(r"^#   ?([a-z-]+)  |  ([a-z-]+)  ", text, re.MULTILINE))
-    assert {kind.value for kind in FaultKind} <= set(chain.from_iterable(words))
-    assert load_scenario(shipped_simulation("faults-example"), 6, 1000) == (
-        FaultSpec(FaultKind.LOST, 1, 1500, 1),
-        FaultSpec(FaultKind.EMERGENCY, 2, 4000, None, 0x7305),
+    path = shipped_simulation("faults-example")
+    text = path.read_text(encoding="utf-8")
+    pairs = re.findall(r"^#   ?([a-z-]+)  |  ([a-z-]+)  ", text, re.MULTILINE)
+    words = set(chain.from_iterable(pairs))
+    kinds = {kind.value for kind in FaultKind}
+    assert kinds <= words
+    lost, emergency = load_scenario(path, 6, 1000)
+    assert lost == FaultSpec(
+        FaultKind.LOST,
+        axis=1,
+        at_cycle=1500,
+        cycles=1,
+    )
+    assert emergency == FaultSpec(
+        FaultKind.EMERGENCY,
+        axis=2,
+        at_cycle=4000,
+        cycles=None,
+        value=0x7305,
     )
 
 
@@ -362,9 +407,8 @@ def test_the_help_of_simulate_shows_how_to_give_a_scenario(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     assert main(["simulate", "--help"]) == ExitCode.OK
-    assert (
-        "drivegain simulate demo --payload disc --faults faults-example"
-    ) in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "drivegain simulate demo --payload disc --faults faults-example" in printed
 
 
 @pytest.mark.parametrize(
@@ -387,9 +431,9 @@ def test_a_time_that_no_cell_lives_to_see_is_reported(times: str, tmp_path: Path
 def test_a_fault_that_the_hub_cannot_carry_is_reported_before_anything_moves(
     kind: FaultKind,
 ) -> None:
-    spec = replace(
-        load_simulation(shipped_simulation("clean")), faults=(FaultSpec(kind, at_cycle=5),)
-    )
+    clean = load_simulation(shipped_simulation("clean"))
+    fault = FaultSpec(kind, at_cycle=5)
+    spec = replace(clean, faults=(fault,))
     with (
         Hub(("can0",)) as hub,
         open_bus(hub.address()) as bus,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import io
 import json
 import os
@@ -17,6 +16,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import IO, Any
 
 import pytest
 from rich.console import Console
@@ -33,6 +33,7 @@ from daq.ledger.audit import AuditAction, read, verify
 from daq.report.proposal import change_table
 from daq.writeback.judgement import NOTHING, Spread
 from daq.writeback.request import GainChange
+from ident.calibration import Calibration
 from ident.drift.change import DISPERSION
 from tests.daq.calibrations import AXES, demo_calibration, recorded, with_recordings
 from tests.daq.histories import history_of
@@ -53,6 +54,17 @@ class Bench:
         """Audit log of the cell."""
         return self.cell.with_name("cell.audit.jsonl")
 
+    @property
+    def content(self) -> bytes:
+        """Content of the controller's file."""
+        return self.controller.read_bytes()
+
+    @property
+    def backups(self) -> list[Path]:
+        """Copies of the controller's file from before a write."""
+        files = self.controller.parent.glob("*.bak")
+        return list(files)
+
     def apply(self, *options: str) -> int:
         """The command."""
         return main(["apply", str(self.calibration), "--cell", str(self.cell), *options])
@@ -68,6 +80,52 @@ class Bench:
         assert verdict.open_writes == ()
         return [entry.action for entry in verdict.entries]
 
+    def add_to_cell_file(self, text: str) -> None:
+        """Add lines to the cell file."""
+        before = self.cell.read_text()
+        self.cell.write_text(before + text)
+
+    def save(self, calibration: Calibration) -> None:
+        """Save a calibration of the configuration that the cell has now."""
+        digest = load_cell(self.cell).digest
+        of_this_cell = replace(calibration, configuration_sha256=digest)
+        save_calibration(of_this_cell, self.calibration)
+
+    def saved(self) -> Calibration:
+        """The calibration in the file."""
+        content = self.calibration.read_bytes()
+        return decode_calibration(content, "")
+
+
+def verify_history(cell: Path) -> int:
+    """Status of `drivegain history --verify`."""
+    return main(["history", str(cell), "--verify"])
+
+
+def error_output(capsys: pytest.CaptureFixture[str]) -> str:
+    """What was printed to standard error, in one line."""
+    printed = capsys.readouterr().err
+    return " ".join(printed.split())
+
+
+def printed_document(capsys: pytest.CaptureFixture[str]) -> Any:
+    """The JSON document that was printed."""
+    printed = capsys.readouterr().out
+    return json.loads(printed)
+
+
+def with_fourth_gain(calibration: Calibration, factor: float) -> Calibration:
+    """The calibration with the gain of J4 times a factor."""
+    gains = list(calibration.gains)
+    gains[3] = replace(gains[3], value=gains[3].value * factor)
+    return replace(calibration, gains=tuple(gains))
+
+
+def run_in_process(arguments: list[str], stdout: int | IO[str]) -> subprocess.CompletedProcess[str]:
+    """Run the command line in a new process."""
+    command = [sys.executable, "-m", "daq", *arguments]
+    return subprocess.run(command, stdout=stdout, stderr=subprocess.PIPE, text=True, check=False)
+
 
 @pytest.fixture
 def bench(tmp_path: Path) -> Bench:
@@ -82,20 +140,16 @@ def _bench_in(folder: Path) -> Bench:
     cells.mkdir()
     controllers.mkdir()
     demo_path = CONFIGS / "cells" / "demo.yaml"
-    text = demo_path.read_text().replace("../robots", str(CONFIGS / "robots"))
+    robots = CONFIGS / "robots"
+    text = demo_path.read_text().replace("../robots", str(robots))
     cell = cells / "cell.yaml"
     cell.write_text(text)
-    shutil.copyfile(CONFIGS / "controllers" / "demo.yaml", controllers / "demo.yaml")
-    calibration = recorded(demo_calibration(), datetime.now(UTC))
-    configuration_sha256 = load_cell(cell).digest
-    changed_calibration = replace(calibration, configuration_sha256=configuration_sha256)
-    save_calibration(
-        changed_calibration,
-        folder / "calibration.yaml",
-    )
     controller = controllers / "demo.yaml"
-    calibration_path = folder / "calibration.yaml"
-    return Bench(cell, controller, calibration_path)
+    shutil.copyfile(CONFIGS / "controllers" / "demo.yaml", controller)
+    bench = Bench(cell, controller, folder / "calibration.yaml")
+    calibration = recorded(demo_calibration(), datetime.now(UTC))
+    bench.save(calibration)
+    return bench
 
 
 @pytest.mark.parametrize(
@@ -137,61 +191,69 @@ def test_exchanged_files_are_named_and_stay_as_they_are(
 ) -> None:
     files = {"cell": bench.cell, "calibration": bench.calibration, "controller": bench.controller}
     before = {path: path.read_bytes() for path in files.values()}
-    assert main(["apply", *(str(files.get(word, word)) for word in order), "--yes"]) != ExitCode.OK
+    arguments = [str(files.get(word, word)) for word in order]
+    status = main(["apply", *arguments, "--yes"])
+    assert status != ExitCode.OK
     said = capsys.readouterr().err
-    assert all(f"{label}:" in said for label in ("found", "expected", "do"))
-    assert all(word in said for word in words)
-    assert {path: path.read_bytes() for path in files.values()} == before
+    for label in ("found", "expected", "do"):
+        assert f"{label}:" in said
+    for word in words:
+        assert word in said
+    after = {path: path.read_bytes() for path in files.values()}
+    assert after == before
     assert not bench.audit.exists()
 
 
 def test_a_dry_run_is_a_table_a_diff_and_no_trace(
     bench: Bench, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    before = bench.controller.read_bytes()
+    before = bench.content
     assert bench.apply() == ExitCode.OK
     shown = capsys.readouterr().out
     fourth = next(line for line in shown.splitlines() if line.startswith("J4"))
     # Old, new ± σ, σ %, change %, change in σ with its mark, nameplate, distance from it.
-    assert " ".join(fourth.split()) == (
-        "J4 -11.52 -9.210 ± 0.037 0.40 -20.1 59.7 * -11.52 -20.1 Nm/A"
-    )
+    row = " ".join(fourth.split())
+    assert row == "J4 -11.52 -9.210 ± 0.037 0.40 -20.1 59.7 * -11.52 -20.1 Nm/A"
     assert "+    gain: -9.2100" in shown
     assert "nothing was written" in shown
-    assert bench.controller.read_bytes() == before
+    assert bench.content == before
     assert not bench.audit.exists()
 
 
 def test_the_command_shows_writes_and_rolls_back(
     bench: Bench, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    before = bench.controller.read_bytes()
+    before = bench.content
     assert bench.apply("--json") == ExitCode.OK
-    dry = json.loads(capsys.readouterr().out)
-    assert (dry["applied"], dry["refusals"], dry["backup"]) == (False, [], None)
-    assert [change["axis"] for change in dry["changes"]] == list(AXES)
-    assert all(change["significant"] for change in dry["changes"])
+    dry = printed_document(capsys)
+    assert dry["applied"] is False
+    assert dry["refusals"] == []
+    assert dry["backup"] is None
+    axes = [change["axis"] for change in dry["changes"]]
+    assert axes == list(AXES)
+    for change in dry["changes"]:
+        assert change["significant"]
 
     assert bench.apply("--yes", "--base", "0" * 64) == ExitCode.CALIBRATION_REFUSED
     assert "--base" in capsys.readouterr().err
-    assert (
-        bench.apply("--yes", "--max-change-percent", "10", "--json") == ExitCode.CALIBRATION_REFUSED
-    )
+    status = bench.apply("--yes", "--max-change-percent", "10", "--json")
+    assert status == ExitCode.CALIBRATION_REFUSED
     outcome = capsys.readouterr()
     refusals = json.loads(outcome.out)["refusals"]
     gates = {refusal["gate"] for refusal in refusals}
     assert gates == {"change"}
     assert "J4" in outcome.err
-    assert bench.controller.read_bytes() == before
+    assert bench.content == before
     assert bench.actions() == [AuditAction.REFUSED] * 2
 
-    assert bench.apply("--yes", "--base", dry["base_sha256"], "--by", "Ada") == ExitCode.OK
+    status = bench.apply("--yes", "--base", dry["base_sha256"], "--by", "Ada")
+    assert status == ExitCode.OK
     lines = capsys.readouterr().out.splitlines()
     last_line = lines[-1]
     undo = shlex.split(last_line.removeprefix("To undo: drivegain "))
     expected = ["rollback", str(bench.cell)]
     assert undo == expected
-    assert b"-9.2100" in bench.controller.read_bytes()
+    assert b"-9.2100" in bench.content
 
     assert bench.apply("--yes") == ExitCode.OK
     assert "these gains already" in capsys.readouterr().out
@@ -200,10 +262,17 @@ def test_the_command_shows_writes_and_rolls_back(
     restored = capsys.readouterr().out
     assert "Restored" in restored
     assert "Let the controller load the file." in restored
-    assert bench.controller.read_bytes() == before
-    there = [AuditAction.APPLY_BEGUN, AuditAction.APPLIED, AuditAction.CALIBRATION_ENTERED]
-    back = [AuditAction.ROLLBACK_BEGUN, AuditAction.ROLLED_BACK]
-    assert bench.actions() == [*[AuditAction.REFUSED] * 2, *there, AuditAction.NOTHING_TO_DO, *back]
+    assert bench.content == before
+    assert bench.actions() == [
+        AuditAction.REFUSED,
+        AuditAction.REFUSED,
+        AuditAction.APPLY_BEGUN,
+        AuditAction.APPLIED,
+        AuditAction.CALIBRATION_ENTERED,
+        AuditAction.NOTHING_TO_DO,
+        AuditAction.ROLLBACK_BEGUN,
+        AuditAction.ROLLED_BACK,
+    ]
     assert read(bench.audit)[2].who == f"Ada (login {login()})"
     events = history_of(bench.cell).events
     targets = [event.target for event in events]
@@ -211,39 +280,37 @@ def test_the_command_shows_writes_and_rolls_back(
 
 
 def test_the_audit_says_who_what_and_from_which_logs(bench: Bench) -> None:
-    before = bench.controller.read_bytes()
+    before = bench.content
     assert bench.apply("--yes") == ExitCode.OK
     begun, applied, entered = read(bench.audit)
-    content = bench.calibration.read_bytes()
-    calibration = decode_calibration(content, "")
-    assert entered.details["document"] == encode_calibration(calibration).decode()
-    expected = (AuditAction.APPLY_BEGUN, login(), str(bench.controller))
-    assert (begun.action, begun.who, begun.subject) == expected
+    document = encode_calibration(bench.saved())
+    assert entered.details["document"] == document.decode()
+    assert begun.action is AuditAction.APPLY_BEGUN
+    assert begun.who == login()
+    assert begun.subject == str(bench.controller)
     assert applied.details == {"begun": begun.number}
-    digests = demo_calibration().sources
     logs = begun.details["logs"]
     assert isinstance(logs, list)
-    assert [(log["name"], log["sha256"]) for log in logs] == [
-        (one.name, one.sha256) for one in digests
-    ]
+    names_and_digests = [(log["name"], log["sha256"]) for log in logs]
+    sources = demo_calibration().sources
+    assert names_and_digests == [(one.name, one.sha256) for one in sources]
     changes = begun.details["changes"]
     assert isinstance(changes, list)
-    assert [(change["axis"], change["old"], change["new"]) for change in changes][3] == (
-        "J4",
-        -11.52,
-        -9.21,
-    )
+    fourth = changes[3]
+    assert fourth["axis"] == "J4"
+    assert fourth["old"] == -11.52
+    assert fourth["new"] == -9.21
     reported = begun.details["calibration"]
     assert isinstance(reported, dict)
     assert reported["file"] == str(bench.calibration)
     assert begun.details["sha256_before"] != begun.details["sha256_after"]
-    assert len(bench.controller.read_bytes()) != len(before)
+    assert len(bench.content) != len(before)
 
 
 def test_another_configuration_is_refused_until_someone_says_so(
     bench: Bench, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    bench.cell.write_text(bench.cell.read_text() + "# changed\n")
+    bench.add_to_cell_file("# changed\n")
     assert bench.apply("--yes") == ExitCode.CALIBRATION_REFUSED
     assert "--configuration-changed" in capsys.readouterr().err
     assert bench.apply("--yes", "--configuration-changed") == ExitCode.OK
@@ -254,9 +321,7 @@ def test_the_mass_may_be_entered_at_the_write_back(
 ) -> None:
     calibration = recorded(demo_calibration(), datetime.now(UTC))
     once = with_recordings(calibration, entered_kg=None)
-    configuration_sha256 = load_cell(bench.cell).digest
-    changed_once = replace(once, configuration_sha256=configuration_sha256)
-    save_calibration(changed_once, bench.calibration)
+    bench.save(once)
     assert bench.apply("--yes") == ExitCode.CALIBRATION_REFUSED
     assert "--payload-mass disc=KG" in capsys.readouterr().err
     assert bench.apply("--yes", "--payload-mass", "disc=4.61") == ExitCode.CALIBRATION_REFUSED
@@ -276,25 +341,28 @@ def test_options_may_be_tighter_than_the_cell_and_not_wider(
     bench: Bench, capsys: pytest.CaptureFixture[str]
 ) -> None:
     policy = ApplyPolicy(max_change_percent=20.0)
-    assert tightened(policy, None, 40.0, None) == replace(policy, max_nameplate_percent=40.0)
-    assert tightened(policy, 20.0, None, 0.5) == replace(policy, max_std_percent=0.5)
-    for asked in ((20.1, None, None), (None, 51.0, None), (None, None, 3.1)):
+    tighter_nameplate = replace(policy, max_nameplate_percent=40.0)
+    assert tightened(policy, None, 40.0, None) == tighter_nameplate
+    tighter_std = replace(policy, max_std_percent=0.5)
+    assert tightened(policy, 20.0, None, 0.5) == tighter_std
+    for wider in ((20.1, None, None), (None, 51.0, None), (None, None, 3.1)):
         with pytest.raises(UsageError, match="wider than the cell's"):
-            tightened(policy, *asked)
+            tightened(policy, *wider)
     assert bench.apply("--max-change-percent", "36") == ExitCode.USAGE
     assert "policy: {apply: {max_change_percent: ...}}" in capsys.readouterr().err
 
 
 def test_the_cell_s_policy_is_the_bound(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
-    bench.cell.write_text(bench.cell.read_text() + "policy: {apply: {max_change_percent: 15}}\n")
-    assert bench.apply("--configuration-changed", "--json") == ExitCode.CALIBRATION_REFUSED
-    printed = capsys.readouterr().out
-    refusals = json.loads(printed)["refusals"]
-    assert [(one["gate"], one["subject"]) for one in refusals] == [("change", "J4")]
+    bench.add_to_cell_file("policy: {apply: {max_change_percent: 15}}\n")
+    status = bench.apply("--configuration-changed", "--json")
+    assert status == ExitCode.CALIBRATION_REFUSED
+    (refusal,) = printed_document(capsys)["refusals"]
+    assert refusal["gate"] == "change"
+    assert refusal["subject"] == "J4"
 
 
 def test_a_policy_that_wants_more_signatures_than_it_names_is_refused(bench: Bench) -> None:
-    bench.cell.write_text(bench.cell.read_text() + "policy: {apply: {signatures: 1}}\n")
+    bench.add_to_cell_file("policy: {apply: {signatures: 1}}\n")
     assert bench.apply() == ExitCode.CONFIGURATION
 
 
@@ -302,10 +370,12 @@ def test_a_rollback_without_a_cell_says_that_it_is_not_recorded(
     bench: Bench, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert bench.apply("--yes") == ExitCode.OK
-    assert main(["rollback", "--to", str(bench.controller)]) == ExitCode.OK
+    without_cell = ["rollback", "--to", str(bench.controller)]
+    assert main(without_cell) == ExitCode.OK
     assert "No audit log has this rollback" in capsys.readouterr().out
     audit = tmp_path / "elsewhere.jsonl"
-    assert main(["rollback", "--to", str(bench.controller), "--audit", str(audit)]) == ExitCode.OK
+    status = main([*without_cell, "--audit", str(audit)])
+    assert status == ExitCode.OK
     assert "No audit log has this rollback" not in capsys.readouterr().out
     actions = [entry.action for entry in read(audit)]
     assert actions == [
@@ -318,13 +388,12 @@ def test_a_rollback_without_a_cell_says_that_it_is_not_recorded(
 def test_without_room_for_the_audit_nothing_is_written(
     bench: Bench, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    before = bench.controller.read_bytes()
+    before = bench.content
     os.mkfifo(bench.audit)
     assert bench.apply("--yes") == ExitCode.CALIBRATION_REFUSED
     assert "the cell's audit, a regular file" in capsys.readouterr().err
-    assert bench.controller.read_bytes() == before
-    files = bench.controller.parent.glob("*.bak")
-    assert not list(files)
+    assert bench.content == before
+    assert bench.backups == []
 
 
 def test_no_one_takes_a_write_out_of_the_cell_s_audit(bench: Bench, tmp_path: Path) -> None:
@@ -345,14 +414,18 @@ def test_an_audit_that_lost_a_write_is_noticed(
     bench: Bench, capsys: pytest.CaptureFixture[str], spoil: str
 ) -> None:
     assert bench.apply("--yes") == ExitCode.OK
-    assert main(["history", str(bench.cell), "--verify"]) == ExitCode.OK
+    assert verify_history(bench.cell) == ExitCode.OK
     lines = bench.audit.read_bytes().splitlines(keepends=True)
-    if spoil == "deleted":
-        bench.audit.unlink()
-    else:
-        kept = {"an end cut off": lines[0], "one line cut": lines[0][:40], "emptied": b""}[spoil]
-        bench.audit.write_bytes(kept)
-    assert main(["history", str(bench.cell), "--verify"]) == ExitCode.DATA_UNFIT
+    match spoil:
+        case "an end cut off":
+            bench.audit.write_bytes(lines[0])
+        case "one line cut":
+            bench.audit.write_bytes(lines[0][:40])
+        case "emptied":
+            bench.audit.write_bytes(b"")
+        case "deleted":
+            bench.audit.unlink()
+    assert verify_history(bench.cell) == ExitCode.DATA_UNFIT
     assert "noted elsewhere" in capsys.readouterr().err
 
 
@@ -360,41 +433,48 @@ def test_an_audit_that_lost_a_rollback_is_noticed(bench: Bench) -> None:
     assert bench.apply("--yes") == ExitCode.OK
     written = bench.audit.read_bytes()
     assert bench.rollback() == ExitCode.OK
-    assert main(["history", str(bench.cell), "--verify"]) == ExitCode.OK
+    assert verify_history(bench.cell) == ExitCode.OK
     bench.audit.write_bytes(written)
-    assert main(["history", str(bench.cell), "--verify"]) == ExitCode.DATA_UNFIT
+    assert verify_history(bench.cell) == ExitCode.DATA_UNFIT
 
 
 def test_two_cells_of_one_controller_s_file_and_one_audit_know_their_own_writes(
     bench: Bench,
 ) -> None:
     shared = "\nhistory: {audit: shared.jsonl, store: %s.sqlite}\n"
-    other = bench.cell.with_name("other.yaml")
-    text = bench.cell.read_text()
-    bench.cell.write_text(text + shared % "one")
-    changed_text = text.replace("name: demo", "name: other")
-    other.write_text(changed_text + shared % "two")
-    for file, factor in ((bench.cell, 1.0), (other, 1.01)):
-        declared = load_cell(file)
-        made = recorded(demo_calibration(), datetime.now(UTC))
-        gains = tuple(replace(gain, value=gain.value * factor) for gain in made.gains)
-        calibration = replace(
-            made, cell=declared.name, configuration_sha256=declared.digest, gains=gains
-        )
-        save_calibration(
-            calibration,
-            bench.calibration,
-        )
-        base = () if factor == 1.0 else ("--base", sha256(bench.controller.read_bytes()))
-        assert (
-            main(["apply", str(bench.calibration), "--cell", str(file), "--yes", *base])
-            == ExitCode.OK
-        )
-    for file in (bench.cell, other):
-        assert main(["history", str(file), "--verify"]) == ExitCode.OK
-    assert main(["rollback", "--cell", str(other)]) == ExitCode.OK
-    for file in (bench.cell, other):
-        assert main(["history", str(file), "--verify"]) == ExitCode.OK
+    cell = bench.cell
+    other = cell.with_name("other.yaml")
+    text = cell.read_text()
+    other_text = text.replace("name: demo", "name: other")
+    cell.write_text(text + shared % "one")
+    other.write_text(other_text + shared % "two")
+
+    _save_calibration_of(cell, bench.calibration, 1.0)
+    assert bench.apply("--yes") == ExitCode.OK
+    other_bench = replace(bench, cell=other)
+    _save_calibration_of(other, bench.calibration, 1.01)
+    base = sha256(bench.content)
+    assert other_bench.apply("--yes", "--base", base) == ExitCode.OK
+    assert verify_history(cell) == ExitCode.OK
+    assert verify_history(other) == ExitCode.OK
+
+    assert other_bench.rollback() == ExitCode.OK
+    assert verify_history(cell) == ExitCode.OK
+    assert verify_history(other) == ExitCode.OK
+
+
+def _save_calibration_of(cell_file: Path, calibration_file: Path, factor: float) -> None:
+    """Save a calibration of a cell, with the gains of the demo times a factor."""
+    cell = load_cell(cell_file)
+    demo = recorded(demo_calibration(), datetime.now(UTC))
+    gains = [replace(gain, value=gain.value * factor) for gain in demo.gains]
+    calibration = replace(
+        demo,
+        cell=cell.name,
+        configuration_sha256=cell.digest,
+        gains=tuple(gains),
+    )
+    save_calibration(calibration, calibration_file)
 
 
 def test_a_dry_run_says_that_the_history_cannot_be_read(
@@ -402,15 +482,15 @@ def test_a_dry_run_says_that_the_history_cannot_be_read(
 ) -> None:
     bench.cell.with_name("cell.history.sqlite").write_text("not a history, " * 100)
     assert bench.apply() == ExitCode.OK
-    error_output = capsys.readouterr().err
-    assert "the history cannot be read" in caplog.text + error_output
+    printed = capsys.readouterr().err
+    assert "the history cannot be read" in caplog.text + printed
 
 
 @pytest.mark.parametrize("name", ["A\udcff", "A\x1b[31m", "A\u202e"])
 def test_a_name_that_cannot_be_shown_is_no_name(bench: Bench, name: str) -> None:
-    before = bench.controller.read_bytes()
+    before = bench.content
     assert bench.apply("--yes", "--by", name) == ExitCode.USAGE
-    assert bench.controller.read_bytes() == before
+    assert bench.content == before
 
 
 def test_after_a_kill_behind_the_write_the_same_command_enters_the_history(
@@ -422,27 +502,32 @@ def test_after_a_kill_behind_the_write_the_same_command_enters_the_history(
     with monkeypatch.context() as patch:
         patch.setattr("daq.writeback.target.enter_calibration", killed)
         assert bench.apply("--yes") == ExitCode.INTERRUPTED
-    assert b"-9.2100" in bench.controller.read_bytes()
-    error_output = capsys.readouterr().err
-    said = " ".join(error_output.split())
+    assert b"-9.2100" in bench.content
+    said = error_output(capsys)
     assert "has the new content, complete; the history lacks this write" in said
     assert "nothing was written" not in said
     for _ in range(2):
         assert bench.apply("--yes") == ExitCode.OK
         assert "these gains already" in capsys.readouterr().out
-        history = history_of(bench.cell)
-        assert history.in_force(str(bench.controller)) == history.entries[0].digest
-        expected = [read(bench.audit)[1].sha256]
-        assert [event.audit for event in history.events] == expected
-    assert main(["history", str(bench.cell), "--verify"]) == ExitCode.OK
+        _assert_first_is_in_force(bench)
+        (event,) = history_of(bench.cell).events
+        applied = read(bench.audit)[1]
+        assert event.audit == applied.sha256
+    assert verify_history(bench.cell) == ExitCode.OK
     assert bench.rollback() == ExitCode.OK
     assert bench.rollback() == ExitCode.OK
+    _assert_first_is_in_force(bench)
+
+
+def _assert_first_is_in_force(bench: Bench) -> None:
+    """Check that the history's first calibration is in force."""
     history = history_of(bench.cell)
-    assert history.in_force(str(bench.controller)) == history.entries[0].digest
+    in_force = history.in_force(str(bench.controller))
+    assert in_force == history.entries[0].digest
 
 
 def test_a_dry_run_of_what_is_there_already_enters_the_history_nothing(bench: Bench) -> None:
-    bench.controller.write_bytes(bench.controller.read_bytes())
+    bench.controller.write_bytes(bench.content)
     assert bench.apply() == ExitCode.OK
     assert not bench.audit.exists()
 
@@ -452,9 +537,9 @@ def test_a_history_that_is_none_does_not_make_a_write_undone(
 ) -> None:
     bench.cell.with_name("cell.history.sqlite").write_text("not a history, " * 100)
     assert bench.apply("--yes") == ExitCode.OK
-    error_output = capsys.readouterr().err
-    assert "the history may lack this write" in caplog.text + error_output
-    assert b"-9.2100" in bench.controller.read_bytes()
+    printed = capsys.readouterr().err
+    assert "the history may lack this write" in caplog.text + printed
+    assert b"-9.2100" in bench.content
 
 
 def _change(axis: str, current_gain: float, new: float, std: float) -> GainChange:
@@ -467,7 +552,8 @@ def significant(changes: tuple[GainChange, ...], known: Spread = NOTHING) -> set
     console = Console(file=shown, width=120)
     console.print(change_table(changes, known))
     lines = shown.getvalue().splitlines()
-    return {line.split()[0] for line in lines if " * " in line}
+    marked = [line for line in lines if " * " in line]
+    return {line.split()[0] for line in marked}
 
 
 def test_what_is_significant_is_a_matter_of_sigma_not_of_per_cent() -> None:
@@ -489,65 +575,59 @@ def test_the_number_in_the_file_has_the_sigma_of_its_calibration(
     def fourth() -> dict[str, object]:
         capsys.readouterr()
         assert bench.apply("--json") == ExitCode.OK
-        document = json.loads(capsys.readouterr().out)
+        document = printed_document(capsys)
         found: dict[str, object] = document["changes"][3]
         return found
 
     # Entered by hand: exact
-    assert fourth()["change_sigmas"] == pytest.approx(-2.31 / (DISPERSION * 0.03684))
+    change_nm_a = -2.31
+    std_nm_a = DISPERSION * 0.03684
+    assert fourth()["change_sigmas"] == pytest.approx(change_nm_a / std_nm_a)
     assert bench.apply("--yes") == ExitCode.OK
-    content = bench.calibration.read_bytes()
-    known = decode_calibration(content, "")
-    gain = known.gains[3]
-    moved = replace(gain, value=gain.value * 1.015)
-    gains = (*known.gains[:3], moved, *known.gains[4:])
-    changed_known = replace(known, gains=gains)
-    save_calibration(changed_known, bench.calibration)
+    known = bench.saved()
+    moved = with_fourth_gain(known, 1.015)
+    save_calibration(moved, bench.calibration)
     found = fourth()
-    assert found["change_sigmas"] == pytest.approx(
-        0.015 * 9.21 / (DISPERSION * 0.03684 * 2**0.5), rel=0.01
-    )
+    change_nm_a = 0.015 * 9.21
+    std_of_both_nm_a = std_nm_a * 2**0.5
+    expected = pytest.approx(change_nm_a / std_of_both_nm_a, rel=0.01)
+    assert found["change_sigmas"] == expected
     assert found["significant"] is False  # 3.7 σ would be, were the number exact
     assert bench.apply() == ExitCode.OK
     shown = capsys.readouterr().out
     assert "σ of both" in shown
     assert "No gain has changed by more than noise: the largest change is J4 +1.5 % (" in shown
     assert "Nothing needs to be written." in shown
-    far = replace(gain, value=gain.value * 1.1)
-    calibration = replace(known, gains=(*known.gains[:3], far, *known.gains[4:]))
-    save_calibration(calibration, bench.calibration)
+    far = with_fourth_gain(known, 1.1)
+    save_calibration(far, bench.calibration)
     assert bench.apply() == ExitCode.OK
     assert "Nothing needs to be written" not in capsys.readouterr().out
 
 
 def _shown_base(shown: str) -> str:
     """Options that the dry run prints for the write."""
-    return shown.split("--yes --base ")[1].split(maxsplit=1)[0]
+    _, after_base = shown.split("--yes --base ")
+    return after_base.split(maxsplit=1)[0]
 
 
 @pytest.mark.slow
 def test_the_base_of_a_dry_run_writes_that_change_and_no_other(
     bench: Bench, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    before = bench.controller.read_bytes()
+    before = bench.content
     fitted = bench.calibration.read_bytes()
     assert bench.apply() == ExitCode.OK
-    base = _shown_base(capsys.readouterr().out)
+    shown = capsys.readouterr().out
+    base = _shown_base(shown)
     assert bench.apply("--json") == ExitCode.OK
-    document = json.loads(capsys.readouterr().out)
+    document = printed_document(capsys)
     assert document["base"] == base
     # Another calibration under the same name.
-    known = decode_calibration(fitted, "")
-    gain = known.gains[3].value
-    moved = replace(known.gains[3], value=gain * 1.01)
-    gains = (*known.gains[:3], moved, *known.gains[4:])
-    calibration = replace(known, gains=gains)
-    save_calibration(calibration, bench.calibration)
+    moved = with_fourth_gain(bench.saved(), 1.01)
+    save_calibration(moved, bench.calibration)
     assert bench.apply("--yes", "--base", base) == ExitCode.CALIBRATION_REFUSED
-    error_output = capsys.readouterr().err
-    assert ("the keys or the factors have changed since the dry run") in " ".join(
-        error_output.split()
-    )
+    said = error_output(capsys)
+    assert "the keys or the factors have changed since the dry run" in said
     assert bench.apply("--base", base) == ExitCode.CALIBRATION_REFUSED
     shown = capsys.readouterr().out
     assert _shown_base(shown) != base
@@ -557,41 +637,38 @@ def test_the_base_of_a_dry_run_writes_that_change_and_no_other(
     swapped = cell.replace("[drives.J1.gain, drives.J2.gain,", "[drives.J2.gain, drives.J1.gain,")
     assert swapped != cell
     bench.cell.write_text(swapped)
-    assert (
-        bench.apply("--yes", "--base", base, "--configuration-changed")
-        == ExitCode.CALIBRATION_REFUSED
-    )
+    status = bench.apply("--yes", "--base", base, "--configuration-changed")
+    assert status == ExitCode.CALIBRATION_REFUSED
     bench.cell.write_text(cell)
     # Another file.
     bench.controller.write_bytes(before + b"# seen by K.\n")
     assert bench.apply("--yes", "--base", base) == ExitCode.CALIBRATION_REFUSED
-    assert "as --base says" in " ".join(capsys.readouterr().err.split())
+    assert "as --base says" in error_output(capsys)
     bench.controller.write_bytes(before)
-    files = bench.controller.parent.glob("*.bak")
-    assert not list(files)
+    assert bench.backups == []
     assert bench.apply("--yes", "--base", base) == ExitCode.OK
-    (backup,) = bench.controller.parent.glob("*.bak")
+    (backup,) = bench.backups
     assert f".{base}.bak" in backup.name
     # Asked for once more, what it wants is there already.
     assert bench.apply("--yes", "--base", base) == ExitCode.OK
-    changed_base = base.replace("-", "_")
-    for wrong in ("abc", base[:-1], changed_base, "x" * 64):
+    with_another_sign = base.replace("-", "_")
+    for wrong in ("abc", base[:-1], with_another_sign, "x" * 64):
         assert bench.apply("--yes", "--base", wrong) == ExitCode.USAGE
 
 
 def test_a_dry_run_of_a_file_that_changed_since_the_recording_reports_the_way_on(
     bench: Bench, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    content = bench.calibration.read_bytes()
-    known = decode_calibration(content, "")
-    digest = hashlib.sha256(bench.controller.read_bytes()).hexdigest()
-    calibration = with_recordings(known, controller_sha256=digest)
+    digest = sha256(bench.content)
+    calibration = with_recordings(bench.saved(), controller_sha256=digest)
     save_calibration(calibration, bench.calibration)
-    bench.controller.write_bytes(bench.controller.read_bytes() + b"# seen by K.\n")
+    changed = bench.content + b"# seen by K.\n"
+    bench.controller.write_bytes(changed)
     assert bench.apply("--yes") == ExitCode.CALIBRATION_REFUSED
     assert "--base" not in capsys.readouterr().out
     assert bench.apply() == ExitCode.CALIBRATION_REFUSED
-    base = _shown_base(capsys.readouterr().out)
+    shown = capsys.readouterr().out
+    base = _shown_base(shown)
     assert bench.apply("--max-change-percent", "1") == ExitCode.CALIBRATION_REFUSED
     assert "--yes" not in capsys.readouterr().out  # another gate refuses
     assert bench.apply("--yes", "--base", base) == ExitCode.OK
@@ -603,10 +680,8 @@ def test_a_dry_run_of_a_file_that_changed_since_the_recording_reports_the_way_on
     assert last_action is AuditAction.NOTHING_TO_DO
     assert bench.apply() == ExitCode.OK
     assert bench.actions().count(AuditAction.NOTHING_TO_DO) == 1
-    assert (
-        bench.apply("--configuration-changed", "--max-std-percent", "0.01")
-        == ExitCode.CALIBRATION_REFUSED
-    )
+    status = bench.apply("--configuration-changed", "--max-std-percent", "0.01")
+    assert status == ExitCode.CALIBRATION_REFUSED
 
 
 @pytest.mark.parametrize("place", ["controller", "cell", "calibration", "store", "notes"])
@@ -617,15 +692,22 @@ def test_no_other_file_becomes_an_audit(
     notes = bench.cell.with_name("notes.txt")
     store = bench.cell.with_name("cell.history.sqlite")
     notes.write_text("the robot was moved\non Monday\n")
-    audit = {"store": store, "notes": notes}.get(place) or getattr(bench, place)
-    bench.cell.write_text(
-        bench.cell.read_text() + f"history: {{store: {json.dumps(str(store))}, audit: "
-        f"{json.dumps(str(audit))}}}\n"
-    )
+    audit_of = {
+        "controller": bench.controller,
+        "cell": bench.cell,
+        "calibration": bench.calibration,
+        "store": store,
+        "notes": notes,
+    }
+    store_name = json.dumps(str(store))
+    audit_name = json.dumps(str(audit_of[place]))
+    bench.add_to_cell_file(f"history: {{store: {store_name}, audit: {audit_name}}}\n")
     paths = [bench.controller, bench.cell, bench.calibration, notes]
     before = [path.read_bytes() for path in paths]
-    strict = ["--max-change-percent", "1"] if refused else []
-    assert bench.apply("--yes", "--configuration-changed", *strict) != ExitCode.OK
+    options = ["--yes", "--configuration-changed"]
+    if refused:
+        options += ["--max-change-percent", "1"]
+    assert bench.apply(*options) != ExitCode.OK
     contents = [path.read_bytes() for path in paths]
     assert contents == before
     assert not store.exists()
@@ -638,12 +720,12 @@ def test_a_rollback_writes_into_no_other_file(bench: Bench) -> None:
     link = bench.controller.with_name("audit.jsonl")
     link.hardlink_to(bench.cell)
     cell = bench.cell.read_bytes()
-    written = bench.controller.read_bytes()
+    written = bench.content
     for audit in (bench.controller, link):
-        assert (
-            main(["rollback", "--to", str(bench.controller), "--audit", str(audit)]) != ExitCode.OK
-        )
-    assert (bench.cell.read_bytes(), bench.controller.read_bytes()) == (cell, written)
+        status = main(["rollback", "--to", str(bench.controller), "--audit", str(audit)])
+        assert status != ExitCode.OK
+    assert bench.cell.read_bytes() == cell
+    assert bench.content == written
 
 
 @pytest.fixture
@@ -676,7 +758,7 @@ def test_a_controller_file_of_a_foreign_group_stays_and_its_group_is_named(
     for place in open_bench.cell.parent.iterdir():
         os.chown(place, NOBODY, -1)
     before = controller.read_bytes()
-    names = {path.name for path in controller.parent.iterdir()}
+    names = sorted(path.name for path in controller.parent.iterdir())
     capsys.readouterr()
     os.seteuid(NOBODY)
     try:
@@ -689,7 +771,8 @@ def test_a_controller_file_of_a_foreign_group_stays_and_its_group_is_named(
     assert "it is as it was; run the command as its owner and in its group" in said
     assert "free space" not in said
     assert controller.read_bytes() == before
-    assert {path.name for path in controller.parent.iterdir()} == names
+    names_after = sorted(path.name for path in controller.parent.iterdir())
+    assert names_after == names
     begun, failed = read(open_bench.audit)[-2:]
     assert failed.action is AuditAction.FAILED
     assert failed.details["begun"] == begun.number
@@ -706,9 +789,9 @@ def test_whatever_the_history_does_a_write_is_not_called_undone(
 
     monkeypatch.setattr("daq.writeback.target.enter_calibration", broken)
     assert bench.apply("--yes") == ExitCode.OK
-    error_output = capsys.readouterr().err
-    assert "the history may lack this write" in caplog.text + error_output
-    assert b"-9.2100" in bench.controller.read_bytes()
+    printed = capsys.readouterr().err
+    assert "the history may lack this write" in caplog.text + printed
+    assert b"-9.2100" in bench.content
 
 
 def _linked(bench: Bench, target: Path) -> None:
@@ -718,20 +801,24 @@ def _linked(bench: Bench, target: Path) -> None:
     bench.controller.symlink_to(target)
 
 
+def _content_or_nothing(path: Path) -> bytes:
+    """Content of a file that may not be there."""
+    if path.exists():
+        return path.read_bytes()
+    return b""
+
+
 def _all_refused(bench: Bench, found: str, capsys: pytest.CaptureFixture[str]) -> None:
-    if bench.controller.exists():
-        before = bench.controller.read_bytes()
-    else:
-        before = b""
+    before = _content_or_nothing(bench.controller)
     capsys.readouterr()
-    for code in (bench.apply(), bench.apply("--yes"), bench.rollback()):
-        assert code == ExitCode.CALIBRATION_REFUSED
-    error_output = capsys.readouterr().err
-    output = " ".join(error_output.split())
-    assert output.count(found) == 3
-    assert main(["history", str(bench.cell), "--verify"]) == ExitCode.CALIBRATION_REFUSED
-    assert found in " ".join(capsys.readouterr().err.split())
-    assert before == (bench.controller.read_bytes() if bench.controller.exists() else b"")
+    assert bench.apply() == ExitCode.CALIBRATION_REFUSED
+    assert bench.apply("--yes") == ExitCode.CALIBRATION_REFUSED
+    assert bench.rollback() == ExitCode.CALIBRATION_REFUSED
+    said = error_output(capsys)
+    assert said.count(found) == 3
+    assert verify_history(bench.cell) == ExitCode.CALIBRATION_REFUSED
+    assert found in error_output(capsys)
+    assert _content_or_nothing(bench.controller) == before
 
 
 def test_a_link_of_the_cell_file_into_a_folder_that_everybody_may_write_is_refused(
@@ -747,10 +834,11 @@ def test_a_link_of_the_cell_file_into_a_folder_that_everybody_may_write_is_refus
 def test_a_linked_folder_of_the_cell_file_that_everybody_may_write_is_refused(
     bench: Bench, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    bench.controller.parent.rename(tmp_path / "open")
-    bench.controller.parent.symlink_to(tmp_path / "open")
+    folder = tmp_path / "open"
+    bench.controller.parent.rename(folder)
+    bench.controller.parent.symlink_to(folder)
     assert bench.apply("--yes") == ExitCode.OK
-    (tmp_path / "open").chmod(0o777)
+    folder.chmod(0o777)
     _all_refused(bench, "everybody may write", capsys)
 
 
@@ -760,19 +848,26 @@ def test_a_linked_folder_of_the_cell_file_that_everybody_may_write_is_refused(
 def test_another_user_s_link_to_the_cell_file_is_refused(
     bench: Bench, tmp_path: Path, folder: bool, behind: bool, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    link = bench.controller.parent if folder else bench.controller
     moved = tmp_path / "moved"
-    alias = tmp_path / "alias"
+    if folder:
+        link = bench.controller.parent
+        controller = moved / "demo.yaml"
+    else:
+        link = bench.controller
+        controller = moved
     link.rename(moved)
     if behind:
+        alias = tmp_path / "alias"
         alias.symlink_to(moved)
         link.symlink_to(alias)
+        foreign = alias
     else:
         link.symlink_to(moved)
+        foreign = link
     assert bench.apply("--yes") == ExitCode.OK
-    os.lchown(alias if behind else link, 4711, 4711)
+    os.lchown(foreign, 4711, 4711)
     _all_refused(bench, "user 4711 has made", capsys)
-    (moved / "demo.yaml" if folder else moved).unlink()  # a rollback would bring it back, there
+    controller.unlink()  # a rollback would bring it back, there
     _all_refused(bench, "user 4711 has made", capsys)
 
 
@@ -795,11 +890,19 @@ def test_a_link_of_one_s_own_is_followed_and_history_and_audit_name_the_file_beh
     assert bench.rollback() == ExitCode.OK
     assert bench.controller.is_symlink()
     assert target.read_bytes() == before
-    assert {entry.subject for entry in read(bench.audit)} == {str(target), "history of demo"}
+    subjects = {entry.subject for entry in read(bench.audit)}
+    assert subjects == {str(target), "history of demo"}
     events = history_of(bench.cell).events
     targets = {event.target for event in events}
     assert targets == {str(target)}
-    assert main(["history", str(bench.cell), "--verify"]) == ExitCode.OK
+    assert verify_history(bench.cell) == ExitCode.OK
+
+
+def _closed_pipe() -> int:
+    """The end to write of a pipe that no one reads."""
+    reading, writing = os.pipe()
+    os.close(reading)
+    return writing
 
 
 @pytest.mark.slow
@@ -814,20 +917,14 @@ def test_an_output_that_fails_after_a_write_says_what_was_written(
         assert bench.apply("--yes") == ExitCode.OK
         commands.remove(apply)
     for arguments in commands:
-        before = bench.controller.read_bytes()
+        before = bench.content
         if closed:
-            reading, writing = os.pipe()
+            writing = _closed_pipe()
         else:
-            reading = None
             writing = os.open("/dev/full", os.O_WRONLY)
-        if reading is not None:
-            os.close(reading)
-        command = [sys.executable, "-m", "daq", *arguments, "--cell", str(bench.cell)]
-        done = subprocess.run(
-            command, stdout=writing, stderr=subprocess.PIPE, text=True, check=False
-        )
+        done = run_in_process([*arguments, "--cell", str(bench.cell)], writing)
         os.close(writing)
-        assert bench.controller.read_bytes() != before
+        assert bench.content != before
         assert done.returncode == ExitCode.UNEXPECTED
         assert re.search(r'^(error: +|\{"error": ")standard output\b', done.stderr, re.MULTILINE)
         assert f"only the printed output is lost: {bench.controller} was written" in done.stderr
@@ -836,44 +933,33 @@ def test_an_output_that_fails_after_a_write_says_what_was_written(
 
 @pytest.mark.slow
 def test_a_report_that_nobody_can_read_is_no_report_of_a_write(bench: Bench) -> None:
-    before = bench.controller.read_bytes()
+    before = bench.content
     arguments = ["apply", str(bench.calibration), "--yes", "--json", "--cell", str(bench.cell)]
-    command = [sys.executable, "-m", "daq", *arguments]
-    reading, writing = os.pipe()
-    os.close(reading)
-    done = subprocess.run(command, stdout=writing, stderr=subprocess.PIPE, text=True, check=False)
+    writing = _closed_pipe()
+    done = run_in_process(arguments, writing)
     os.close(writing)
     assert done.returncode == ExitCode.UNEXPECTED
     assert "whose other end is closed" in done.stderr
     assert "nothing was written" in done.stderr
-    assert bench.controller.read_bytes() == before
+    assert bench.content == before
     # A reader that is there, or a file, takes the report.
     report = bench.cell.with_name("report.json")
     with report.open("w") as file:
-        done = subprocess.run(command, stdout=file, stderr=subprocess.PIPE, text=True, check=False)
+        done = run_in_process(arguments, file)
     assert done.returncode == ExitCode.OK
     assert json.loads(report.read_text())
-    assert bench.controller.read_bytes() != before
+    assert bench.content != before
 
 
 @pytest.mark.slow
 def test_a_change_that_cannot_be_shown_is_not_written(bench: Bench) -> None:
-    before = bench.controller.read_bytes()
-    command = [
-        sys.executable,
-        "-m",
-        "daq",
-        "apply",
-        str(bench.calibration),
-        "--yes",
-        "--cell",
-        str(bench.cell),
-    ]
+    before = bench.content
+    arguments = ["apply", str(bench.calibration), "--yes", "--cell", str(bench.cell)]
     with Path("/dev/full").open("w") as full:
-        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+        done = run_in_process(arguments, full)
     assert done.returncode == ExitCode.UNEXPECTED
     assert "no space left" in done.stderr
-    assert bench.controller.read_bytes() == before
+    assert bench.content == before
 
 
 @pytest.mark.slow
@@ -882,11 +968,9 @@ def test_an_output_that_fails_says_which_were_written_before(
 ) -> None:
     assert bench.apply("--yes") == ExitCode.OK
     plot = bench.cell.with_name("gains.svg")
-    folder = bench.cell.with_name("none")
-    assert (
-        main(["history", str(bench.cell), "--plot", str(plot), "--csv", str(folder / "x.csv")])
-        == ExitCode.UNEXPECTED
-    )
+    csv = bench.cell.with_name("none") / "x.csv"
+    status = main(["history", str(bench.cell), "--plot", str(plot), "--csv", str(csv)])
+    assert status == ExitCode.UNEXPECTED
     shown = capsys.readouterr().err
     assert f"kept:     {plot} was written before that" in shown
     assert "nothing was changed" not in shown
@@ -913,21 +997,22 @@ def test_a_signal_within_a_write_is_heard_when_the_write_and_its_records_are_who
 
     works: list[Callable[[], int]] = [lambda: bench.apply("--yes"), bench.rollback]
     for work in works:
-        before = bench.controller.read_bytes()
+        before = bench.content
         with monkeypatch.context() as patch:
             patch.setattr(place, interrupted)
             assert work() == ExitCode.INTERRUPTED
-        assert bench.controller.read_bytes() != before
+        assert bench.content != before
         shown = capsys.readouterr().err
         assert f"interrupted: {bench.controller} was written" in shown
         assert shown.count("\n") == 1
-    assert bench.actions()[:3] == [
+    assert bench.actions() == [
         AuditAction.APPLY_BEGUN,
         AuditAction.APPLIED,
         AuditAction.CALIBRATION_ENTERED,
+        AuditAction.ROLLBACK_BEGUN,
+        AuditAction.ROLLED_BACK,
     ]
-    assert bench.actions()[3:] == [AuditAction.ROLLBACK_BEGUN, AuditAction.ROLLED_BACK]
-    assert main(["history", str(bench.cell), "--verify"]) == ExitCode.OK
+    assert verify_history(bench.cell) == ExitCode.OK
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -937,11 +1022,11 @@ def test_a_signal_before_the_write_says_that_nothing_was_changed(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    before = bench.controller.read_bytes()
+    before = bench.content
     monkeypatch.setattr("daq.writeback.target.propose", lambda *_: signal.raise_signal(number))
     assert bench.apply("--yes") == ExitCode.INTERRUPTED
     assert capsys.readouterr().err == "interrupted: nothing was changed\n"
-    assert bench.controller.read_bytes() == before
+    assert bench.content == before
     assert not bench.audit.exists()
 
 
@@ -949,12 +1034,13 @@ def test_a_signal_before_the_write_says_that_nothing_was_changed(
 def test_an_option_of_the_drives_is_not_ignored_without_them(
     bench: Bench, option: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    before = bench.controller.read_bytes()
-    codes = {bench.apply("--yes", option), bench.rollback(option), bench.apply(option)}
-    assert codes == {ExitCode.USAGE}
-    error_output = capsys.readouterr().err
-    assert error_output.count(f"error:    {option}\n") == 3
-    assert bench.controller.read_bytes() == before
+    before = bench.content
+    assert bench.apply("--yes", option) == ExitCode.USAGE
+    assert bench.rollback(option) == ExitCode.USAGE
+    assert bench.apply(option) == ExitCode.USAGE
+    printed = capsys.readouterr().err
+    assert printed.count(f"error:    {option}\n") == 3
+    assert bench.content == before
 
 
 @pytest.mark.slow
@@ -966,7 +1052,8 @@ def test_the_name_of_a_controller_file_neither_commands_the_terminal_nor_makes_a
     assert bench.apply("--to", str(file), "--yes") == ExitCode.OK
     assert bench.rollback("--to", str(file)) == ExitCode.OK
     plot = bench.cell.with_name("p\nerror: fake.svg")
-    assert main(["history", str(bench.cell), "--plot", str(plot)]) == ExitCode.OK
+    status = main(["history", str(bench.cell), "--plot", str(plot)])
+    assert status == ExitCode.OK
     file.unlink()
     assert bench.apply("--to", str(file)) == ExitCode.CALIBRATION_REFUSED
     output = capsys.readouterr()
@@ -983,45 +1070,40 @@ def test_something_else_in_place_of_the_lock_is_named(
 ) -> None:
     lock = bench.controller.with_name(".demo.yaml.lock")
     made(lock)
-    before = bench.controller.read_bytes()
+    before = bench.content
     assert bench.apply("--yes") == ExitCode.UNEXPECTED
-    error_output = capsys.readouterr().err
-    assert f"error:    {lock}\n" in error_output
-    assert bench.controller.read_bytes() == before
+    printed = capsys.readouterr().err
+    assert f"error:    {lock}\n" in printed
+    assert bench.content == before
 
 
 def test_an_audit_in_no_folder_is_named(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
     audit = bench.cell.with_name("none") / "audit.jsonl"
-    bench.cell.write_text(f"{bench.cell.read_text()}history: {{audit: {json.dumps(str(audit))}}}\n")
-    before = bench.controller.read_bytes()
+    audit_name = json.dumps(str(audit))
+    bench.add_to_cell_file(f"history: {{audit: {audit_name}}}\n")
+    before = bench.content
     assert bench.apply("--yes", "--configuration-changed") == ExitCode.UNEXPECTED
-    error_output = capsys.readouterr().err
-    assert f"error:    {audit}\n" in error_output
-    assert bench.controller.read_bytes() == before
+    printed = capsys.readouterr().err
+    assert f"error:    {audit}\n" in printed
+    assert bench.content == before
 
 
 @pytest.mark.slow
 def test_a_terminal_without_greek_letters_gets_them_spelled_out(bench: Bench) -> None:
     file = bench.controller.with_name("é😀.yaml")
     bench.controller.rename(file)
-    command = [
-        sys.executable,
-        "-m",
-        "daq",
-        "apply",
-        str(bench.calibration),
-        "--cell",
-        str(bench.cell),
-        "--to",
-    ]
+    command = [sys.executable, "-m", "daq", "apply", str(bench.calibration)]
+    command += ["--cell", str(bench.cell), "--to", str(file)]
+    environment = {**os.environ, "PYTHONIOENCODING": "ascii"}
     shown = []
-    for more in ([], ["--json"]):
-        environment = {**os.environ, "PYTHONIOENCODING": "ascii"}
+    for options in ([], ["--json"]):
         done = subprocess.run(
-            [*command, str(file), *more], capture_output=True, env=environment, check=False
+            [*command, *options], capture_output=True, env=environment, check=False
         )
-        assert (done.returncode, done.stderr) == (ExitCode.OK, b"")
-        shown.append(done.stdout.decode("ascii"))
+        assert done.returncode == ExitCode.OK
+        assert done.stderr == b""
+        text = done.stdout.decode("ascii")
+        shown.append(text)
     assert "-9.210 \\u00b1 0.037" in shown[0]
     document = json.loads(shown[1])
     assert document["file"] == str(file)

@@ -12,7 +12,7 @@ import math
 import multiprocessing
 import os
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -37,18 +37,31 @@ from daq.ledger.audit import (
 )
 
 NOW = datetime(2025, 1, 2, 3, 4, 5, tzinfo=UTC)
-TREES = st.recursive(
+LINE_END = ord("\n")
+SCALARS = (
     st.none()
     | st.booleans()
     | st.integers()
     | st.floats(allow_nan=False, allow_infinity=False)
-    | st.text(st.characters(), max_size=20),
-    lambda inner: (
-        st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=8), inner, max_size=3)
-    ),
-    max_leaves=8,
+    | st.text(st.characters(), max_size=20)
 )
+
+
+def _containers(inner: st.SearchStrategy[object]) -> st.SearchStrategy[object]:
+    """Lists and objects of JSON values."""
+    lists = st.lists(inner, max_size=3)
+    keys = st.text(max_size=8)
+    return lists | st.dictionaries(keys, inner, max_size=3)
+
+
+TREES = st.recursive(SCALARS, _containers, max_leaves=8)
 DETAILS = st.dictionaries(st.text(max_size=8), TREES, max_size=4)
+WRITES = st.tuples(
+    st.sampled_from(AuditAction),
+    st.text(max_size=30),
+    st.text(max_size=30),
+    DETAILS,
+)
 
 
 @contextmanager
@@ -58,8 +71,9 @@ def _folder() -> Iterator[Path]:
 
 
 def _filled(path: Path, count: int = 6) -> tuple[AuditEntry, ...]:
-    return tuple(
-        append(
+    entries = []
+    for k in range(count):
+        one = append(
             path,
             AuditAction.PROPOSED,
             at=NOW + timedelta(seconds=k),
@@ -67,46 +81,81 @@ def _filled(path: Path, count: int = 6) -> tuple[AuditEntry, ...]:
             subject="/c/x.yaml",
             details={"k": k},
         )
-        for k in range(count)
-    )
+        entries.append(one)
+    return tuple(entries)
+
+
+def _append(
+    path: Path, action: AuditAction, subject: str, details: dict[str, object], who: str = "K."
+) -> AuditEntry:
+    """Append an entry of someone."""
+    return append(path, action, at=NOW, who=who, subject=subject, details=details)
+
+
+def _add_bytes(path: Path, content: bytes) -> None:
+    """Write bytes at the end of a file."""
+    with path.open("ab") as stream:
+        stream.write(content)
+
+
+def _content(lines: list[bytes]) -> bytes:
+    """Content of a file with these lines."""
+    ended = [line + b"\n" for line in lines]
+    return b"".join(ended)
 
 
 def _judge(lines: list[bytes]) -> audit.AuditVerdict:
-    content = b"".join(line + b"\n" for line in lines)
-    return judge_chain(content, lambda _: None)
+    return judge_chain(_content(lines), lambda _: None)
 
 
 def _lines(path: Path) -> list[bytes]:
     return path.read_bytes().splitlines()
 
 
+def _six_lines() -> list[bytes]:
+    """Lines of an audit with six entries."""
+    with _folder() as folder:
+        path = folder / "a"
+        _filled(path)
+        return _lines(path)
+
+
+def _flaws(verdict: audit.AuditVerdict) -> list[tuple[int, Flaw]]:
+    """Line and kind of each flaw."""
+    return [(flaw.line, flaw.flaw) for flaw in verdict.flaws]
+
+
+def _numbers(entries: Iterable[AuditEntry]) -> list[int]:
+    """Numbers of entries."""
+    return [one.number for one in entries]
+
+
+def _digest(content: bytes) -> str:
+    """SHA-256 in hexadecimal digits."""
+    return hashlib.sha256(content).hexdigest()
+
+
 @pytest.mark.slow
-@given(
-    st.lists(
-        st.tuples(
-            st.sampled_from(AuditAction), st.text(max_size=30), st.text(max_size=30), DETAILS
-        ),
-        max_size=5,
-    )
-)
+@given(st.lists(WRITES, max_size=5))
 def test_what_is_appended_is_read_back_and_the_chain_holds(
-    asked: list[tuple[AuditAction, str, str, dict[str, object]]],
+    drawn: list[tuple[AuditAction, str, str, dict[str, object]]],
 ) -> None:
-    asked = [(a, w, s, d) for a, w, s, d in asked if a is not AuditAction.TORN_LINE]
+    writes = [write for write in drawn if write[0] is not AuditAction.TORN_LINE]
     with _folder() as folder:
         path = folder / "cell.audit.jsonl"
         assert read(path) == ()
-        written = [append(path, a, at=NOW, who=w, subject=s, details=d) for a, w, s, d in asked]
+        written = []
+        for action, who, subject, details in writes:
+            one = append(path, action, at=NOW, who=who, subject=subject, details=details)
+            written.append(one)
         assert list(read(path)) == written
-        expected = list(range(1, len(asked) + 1))
-        assert [one.number for one in written] == expected
-        for one, (action, who, subject, details) in zip(written, asked, strict=True):
-            assert (one.action, one.who, one.subject, one.details) == (
-                action,
-                who,
-                subject,
-                details,
-            )
+        expected = list(range(1, len(writes) + 1))
+        assert _numbers(written) == expected
+        for one, (action, who, subject, details) in zip(written, writes, strict=True):
+            assert one.action == action
+            assert one.who == who
+            assert one.subject == subject
+            assert one.details == details
         heads = [one.sha256 for one in written]
         verdict = verify(path, heads=heads)
         assert verdict.holds
@@ -117,25 +166,26 @@ def test_what_is_appended_is_read_back_and_the_chain_holds(
 def test_the_digest_is_sha256_of_canonical_json_and_covers_the_one_before(tmp_path: Path) -> None:
     path = tmp_path / "a"
     first, second = _filled(path, 2)
-    a_folder = tmp_path / "a"
-    tree = json.loads(_lines(a_folder)[1])
+    second_line = _lines(path)[1]
+    tree = json.loads(second_line)
     assert tree.pop("sha256") == second.sha256
     assert tree["previous"] == first.sha256
     text = json.dumps(tree, sort_keys=True, separators=(",", ":"))
-    expected = hashlib.sha256(text.encode()).hexdigest()
-    assert second.sha256 == expected
+    assert second.sha256 == _digest(text.encode())
     assert first.previous == "0" * 64
 
 
 @pytest.mark.slow
 @given(line=st.integers(0, 5), data=st.data())
 def test_one_changed_byte_is_found_at_its_line(line: int, data: st.DataObject) -> None:
-    with _folder() as folder:
-        _filled(folder / "a")
-        lines = _lines(folder / "a")
-    place = data.draw(st.integers(0, len(lines[line]) - 1))
-    byte = data.draw(st.integers(0, 255).filter(lambda b: b not in {lines[line][place], 10}))
-    lines[line] = lines[line][:place] + bytes([byte]) + lines[line][place + 1 :]
+    lines = _six_lines()
+    before = lines[line]
+    place = data.draw(st.integers(0, len(before) - 1))
+    excluded = {before[place], LINE_END}
+    other_bytes = st.integers(0, 255).filter(lambda b: b not in excluded)
+    changed = bytearray(before)
+    changed[place] = data.draw(other_bytes)
+    lines[line] = bytes(changed)
     verdict = _judge(lines)
     if line < 5:
         assert verdict.broken == line + 1
@@ -148,13 +198,11 @@ def test_one_changed_byte_is_found_at_its_line(line: int, data: st.DataObject) -
 
 @given(line=st.integers(0, 4), count=st.integers(1, 4))
 def test_removed_lines_are_found_where_they_were(line: int, count: int) -> None:
-    with _folder() as folder:
-        _filled(folder / "a")
-        lines = _lines(folder / "a")
+    lines = _six_lines()
     last = min(line + count, 5)
-    verdict = _judge(lines[:line] + lines[last:])
-    expected = [(line + 1, Flaw.REMOVED)]
-    assert [(flaw.line, flaw.flaw) for flaw in verdict.flaws] == expected
+    del lines[line:last]
+    verdict = _judge(lines)
+    assert _flaws(verdict) == [(line + 1, Flaw.REMOVED)]
     line_text = str(line + 1)
     assert line_text in verdict.flaws[0].says
 
@@ -162,22 +210,22 @@ def test_removed_lines_are_found_where_they_were(line: int, count: int) -> None:
 @pytest.mark.slow
 @given(st.permutations(range(6)))
 def test_a_changed_order_is_found(order: list[int]) -> None:
-    with _folder() as folder:
-        _filled(folder / "a")
-        lines = _lines(folder / "a")
+    lines = _six_lines()
     verdict = _judge([lines[k] for k in order])
-    first = next((place for place, k in enumerate(order) if place != k), None)
-    assert verdict.broken == (None if first is None else first + 1)
+    moved = [place for place, k in enumerate(order) if place != k]
+    if moved:
+        assert verdict.broken == moved[0] + 1
+    else:
+        assert verdict.broken is None
     flaws = {flaw.flaw for flaw in verdict.flaws}
     assert flaws <= {Flaw.MOVED}
 
 
 @given(place=st.integers(0, 6), copied=st.integers(0, 5))
 def test_a_line_that_was_added_twice_is_found(place: int, copied: int) -> None:
-    with _folder() as folder:
-        _filled(folder / "a")
-        lines = _lines(folder / "a")
-    verdict = _judge([*lines[:place], lines[copied], *lines[place:]])
+    lines = _six_lines()
+    lines.insert(place, lines[copied])
+    verdict = _judge(lines)
     assert not verdict.holds
     flaws = {flaw.flaw for flaw in verdict.flaws}
     assert Flaw.ADDED in flaws
@@ -191,33 +239,32 @@ def test_a_forged_entry_with_a_right_digest_breaks_the_link(place: int) -> None:
     forged = entry(
         was.number, was.at, "another person", was.action, was.subject, was.details, was.previous
     )
-    lines = [encode(forged if one is was else one) for one in entries]
+    lines = [encode(one) for one in entries]
+    lines[place] = encode(forged)
     verdict = _judge(lines)
-    expected = [(place + 1, Flaw.EDITED)]
-    assert [(flaw.line, flaw.flaw) for flaw in verdict.flaws] == expected
+    assert _flaws(verdict) == [(place + 1, Flaw.EDITED)]
     # Put between two others, it is one entry of that number too many.
-    verdict = _judge([encode(one) for one in (*entries[:place], forged, *entries[place:])])
+    lines = [encode(one) for one in entries]
+    lines.insert(place, encode(forged))
+    verdict = _judge(lines)
     assert not verdict.holds
 
 
 def test_a_cut_off_tail_is_found_by_who_noted_an_entry_elsewhere(tmp_path: Path) -> None:
-    entries = _filled(tmp_path / "a")
     path = tmp_path / "a"
-    lines = _lines(path)[:4]
-    content = b"".join(line + b"\n" for line in lines)
-    (tmp_path / "a").write_bytes(content)
-    assert verify(tmp_path / "a").holds
+    entries = _filled(path)
+    remaining = _lines(path)[:4]
+    path.write_bytes(_content(remaining))
+    assert verify(path).holds
     heads = [entries[2].sha256, entries[5].sha256]
-    a_folder = tmp_path / "a"
-    verdict = verify(a_folder, heads=heads)
-    expected = [(5, Flaw.CUT_OFF)]
-    assert [(flaw.line, flaw.flaw) for flaw in verdict.flaws] == expected
+    verdict = verify(path, heads=heads)
+    assert _flaws(verdict) == [(5, Flaw.CUT_OFF)]
     says = verdict.flaws[0].says
     sha256 = entries[5].sha256
     assert sha256[:12] in says
-    none_folder = tmp_path / "none"
-    broken = verify(none_folder, heads=[entries[0].sha256]).broken
-    assert broken == 1
+    none = tmp_path / "none"
+    verdict = verify(none, heads=[entries[0].sha256])
+    assert verdict.broken == 1
 
 
 @pytest.mark.slow
@@ -236,34 +283,38 @@ def test_what_killed_writers_leave_stays_and_is_reported(
             _filled(path, 1)
             written = path.read_bytes()
             assert written.startswith(before)
-            length = len(before) + round(cut * (len(written) - len(before)))
+            added = len(written) - len(before)
+            length = len(before) + round(cut * added)
             path.write_bytes(written[:length])
             assert verify(path).holds
-        kept = path.read_bytes()
-        last = append(path, AuditAction.APPLIED, at=NOW, who="K.", subject="x", details={})
-        assert path.read_bytes().startswith(kept)
+        left = path.read_bytes()
+        last = _append(path, AuditAction.APPLIED, "x", {})
+        assert path.read_bytes().startswith(left)
         assert read(path)[-1] == last
         verdict = verify(path)
         assert verdict.holds
         expected = list(range(1, len(verdict.entries) + 1))
-        numbers = [one.number for one in verdict.entries]
-        assert numbers == expected
+        assert _numbers(verdict.entries) == expected
         # A fragment that is removed or changed after it was reported is missed.
         lines = _lines(path)
         for torn in verdict.torn:
-            holds = _judge(lines[: torn - 1] + lines[torn:]).holds
-            assert not holds
-            largest_line_count = max(len(lines[torn - 1]) - 1, 0)
-            place = data.draw(st.integers(0, largest_line_count))
-            changed = lines[torn - 1][:place] + b"#" + lines[torn - 1][place:]
-            assert not _judge([*lines[: torn - 1], changed, *lines[torn:]]).holds
+            index = torn - 1
+            before_it = lines[:index]
+            behind_it = lines[torn:]
+            without = _judge([*before_it, *behind_it])
+            assert not without.holds
+            fragment = lines[index]
+            last_place = max(len(fragment) - 1, 0)
+            place = data.draw(st.integers(0, last_place))
+            changed = fragment[:place] + b"#" + fragment[place:]
+            with_changed = _judge([*before_it, changed, *behind_it])
+            assert not with_changed.holds
 
 
 def test_zeros_after_a_power_cut_are_an_unfinished_line(tmp_path: Path) -> None:
     path = tmp_path / "a"
     _filled(path, 2)
-    with path.open("ab") as stream:
-        stream.write(bytes(100))
+    _add_bytes(path, bytes(100))
     assert verify(path).torn == (3,)
     _filled(path, 1)
     verdict = verify(path)
@@ -297,20 +348,22 @@ def test_nothing_is_appended_to_a_file_that_is_no_audit(tmp_path: Path, content:
     # After entries it is no writer's unfinished line either.
     path.unlink()
     _filled(path, 1)
-    with path.open("ab") as stream:
-        stream.write(content)
+    _add_bytes(path, content)
     assert not verify(path).holds
 
 
 def test_what_is_left_of_a_first_entry_is_no_other_file(tmp_path: Path) -> None:
-    _filled(tmp_path / "whole", 1)
-    whole = (tmp_path / "whole").read_bytes()
-    for length in range(len(whole) - 1):
+    complete = tmp_path / "complete"
+    _filled(complete, 1)
+    content = complete.read_bytes()
+    for length in range(len(content) - 1):
         path = tmp_path / str(length)
-        path.write_bytes(whole[:length])
-        number = append(path, AuditAction.APPLIED, at=NOW, who="", subject="", details={}).number
-        expected = 1 + (length > 0)
-        assert number == expected
+        path.write_bytes(content[:length])
+        one = _append(path, AuditAction.APPLIED, "", {}, who="")
+        if length == 0:
+            assert one.number == 1
+        else:
+            assert one.number == 2
         assert verify(path).holds
 
 
@@ -323,9 +376,8 @@ def test_nothing_is_appended_to_a_last_line_that_was_changed(
     path = tmp_path / "a"
     _filled(path, 2)
     first, last = _lines(path)
-    content = first + b"\n" + spoil(last) + b"\n"
-    path.write_bytes(content)
-    spoiled = path.read_bytes()
+    spoiled = _content([first, spoil(last)])
+    path.write_bytes(spoiled)
     with pytest.raises(AuditUnusable, match="line 2, which drivegain did not write"):
         _filled(path, 1)
     assert exit_code(AuditUnusable) == 3
@@ -335,10 +387,17 @@ def test_nothing_is_appended_to_a_last_line_that_was_changed(
 def _write(
     begun: AuditAction, path: Path, subject: Path, before: bytes, after: bytes
 ) -> AuditEntry:
-    digests = {}
-    for name, b in (("before", before), ("after", after)):
-        digests[f"sha256_{name}"] = hashlib.sha256(b).hexdigest()
-    return append(path, begun, at=NOW, who="K.", subject=str(subject), details=digests)
+    digests: dict[str, object] = {
+        "sha256_before": _digest(before),
+        "sha256_after": _digest(after),
+    }
+    return _append(path, begun, str(subject), digests)
+
+
+def _open_contents(path: Path) -> dict[int, Content]:
+    """What files have of the writes without an end, by the numbers of their entries."""
+    open_writes = verify(path).open_writes
+    return {one.begun.number: one.content for one in open_writes}
 
 
 @pytest.mark.parametrize("begun", [AuditAction.APPLY_BEGUN, AuditAction.ROLLBACK_BEGUN])
@@ -359,27 +418,20 @@ def test_of_a_write_without_an_end_the_file_reports_which_it_is(
     if now is not None:
         file.write_bytes(now)
     first = _write(begun, path, file, b"old", b"new")
-    open_writes = verify(path).open_writes
-    assert [(one.begun, one.content) for one in open_writes] == [(first, content)]
+    (open_write,) = verify(path).open_writes
+    assert open_write.begun == first
+    assert open_write.content == content
+
     # The next write on the same file saw what was there, whatever is there by now.
-    subject = tmp_path / "y.yaml"
-    _write(begun, path, subject, b"other", b"file")
+    other = tmp_path / "y.yaml"
+    _write(begun, path, other, b"other", b"file")
     second = _write(begun, path, file, b"new", b"newest")
     file.write_bytes(b"newest")
-    details = {"begun": second.number}
-    append(
-        path,
-        AuditAction.APPLIED,
-        at=NOW,
-        who="K.",
-        subject=str(file),
-        details=details,
-    )
-    found = {one.begun.number: one.content for one in verify(path).open_writes}
-    expected = {1: Content.AFTER, 2: Content.OTHER}
-    assert found == expected
-    (tmp_path / "y.yaml").mkdir()  # unreadable
-    assert {one.begun.number: one.content for one in verify(path).open_writes}[2] is Content.UNKNOWN
+    _append(path, AuditAction.APPLIED, str(file), {"begun": second.number})
+    assert _open_contents(path) == {1: Content.AFTER, 2: Content.OTHER}
+
+    other.mkdir()  # unreadable
+    assert _open_contents(path)[2] is Content.UNKNOWN
 
 
 @pytest.mark.parametrize("end", [AuditAction.APPLIED, AuditAction.ROLLED_BACK, AuditAction.FAILED])
@@ -387,51 +439,37 @@ def test_a_write_with_an_end_is_not_open(tmp_path: Path, end: AuditAction) -> No
     path = tmp_path / "a"
     subject = tmp_path / "x"
     begun = _write(AuditAction.APPLY_BEGUN, path, subject, b"old", b"new")
-    a_folder = tmp_path / "a"
-    details = {"begun": begun.number}
-    append(
-        a_folder,
-        end,
-        at=NOW,
-        who="K.",
-        subject=begun.subject,
-        details=details,
-    )
-    open_writes = verify(tmp_path / "a").open_writes
-    assert open_writes == ()
+    _append(path, end, begun.subject, {"begun": begun.number})
+    assert verify(path).open_writes == ()
 
 
 def test_no_number_that_is_not_finite_gets_in(tmp_path: Path) -> None:
     path = tmp_path / "a"
-    details = {"gain": math.nan}
     with pytest.raises(ValueError, match="JSON"):
-        append(
-            path,
-            AuditAction.PROPOSED,
-            at=NOW,
-            who="",
-            subject="",
-            details=details,
-        )
-    assert (tmp_path / "a").read_bytes() == b""
+        _append(path, AuditAction.PROPOSED, "", {"gain": math.nan}, who="")
+    assert path.read_bytes() == b""
 
 
 def test_what_is_no_regular_file_is_refused_and_no_one_waits(tmp_path: Path) -> None:
-    os.mkfifo(tmp_path / "fifo")
-    for path in (tmp_path / "fifo", tmp_path, Path("/dev/zero")):
+    fifo = tmp_path / "fifo"
+    os.mkfifo(fifo)
+    for path in (fifo, tmp_path, Path("/dev/zero")):
         with pytest.raises(AuditUnusable):
             read(path)
         with pytest.raises((AuditUnusable, PermissionError)):
             _filled(path, 1)
-    a_folder = tmp_path / "gone" / "a"
-    (tmp_path / "dangling").symlink_to(a_folder)
+
+    folder = tmp_path / "gone"
+    target = folder / "a"
+    dangling = tmp_path / "dangling"
+    dangling.symlink_to(target)
     for refused in (lambda path: _filled(path, 1), read, verify):
         with pytest.raises(AuditUnusable, match="where there is no file"):
-            refused(tmp_path / "dangling")
-    (tmp_path / "gone").mkdir()
-    (tmp_path / "gone" / "a").touch()
-    _filled(tmp_path / "dangling", 1)
-    assert len(read(tmp_path / "gone" / "a")) == 1
+            refused(dangling)
+    folder.mkdir()
+    target.touch()
+    _filled(dangling, 1)
+    assert len(read(target)) == 1
 
 
 def test_the_entry_is_on_the_disk_and_so_is_the_folder_of_a_new_audit(
@@ -444,9 +482,9 @@ def test_the_entry_is_on_the_disk_and_so_is_the_folder_of_a_new_audit(
         flushed.append(str(path.readlink()))
 
     monkeypatch.setattr(os, "fsync", noted)
-    _filled(tmp_path / "a", 2)
-    expected = [str(tmp_path / "a"), str(tmp_path), str(tmp_path / "a")]
-    assert flushed == expected
+    path = tmp_path / "a"
+    _filled(path, 2)
+    assert flushed == [str(path), str(tmp_path), str(path)]
 
 
 def _append_many(path: Path, who: str) -> None:
@@ -456,42 +494,46 @@ def _append_many(path: Path, who: str) -> None:
 
 def test_many_writers_make_one_chain(tmp_path: Path) -> None:
     context = multiprocessing.get_context("fork")
+    path = tmp_path / "a"
     writers = []
-    for k in range(4):
-        writers.append(context.Process(target=_append_many, args=(tmp_path / "a", str(k))))
+    for who in "0123":
+        writer = context.Process(target=_append_many, args=(path, who))
+        writers.append(writer)
     for writer in writers:
         writer.start()
     for writer in writers:
         writer.join()
-    verdict = verify(tmp_path / "a")
+    verdict = verify(path)
     assert verdict.holds
     assert len(verdict.entries) == 100
     for who in "0123":
-        expected = list(range(25))
-        assert [one.details["k"] for one in verdict.entries if one.who == who] == expected
+        of_writer = [one for one in verdict.entries if one.who == who]
+        numbers = [one.details["k"] for one in of_writer]
+        assert numbers == list(range(25))
 
 
 def test_a_lock_that_is_never_given_back_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(audit, "_PAUSE_S", 0.0)
-    with (tmp_path / "a").open("w") as held:
-        fcntl.flock(held, fcntl.LOCK_EX)
+    path = tmp_path / "a"
+    with path.open("w") as locked:
+        fcntl.flock(locked, fcntl.LOCK_EX)
         with pytest.raises(AuditUnusable, match="keeps it locked"):
-            _filled(tmp_path / "a", 1)
+            _filled(path, 1)
 
 
 def test_an_entry_cannot_hide_a_missing_torn_line(tmp_path: Path) -> None:
     """An entry reports an unfinished line, and none is there: it was removed."""
-    _filled(tmp_path / "a", 1)
-    with (tmp_path / "a").open("ab") as stream:
-        stream.write(b'{"action":')
-    _filled(tmp_path / "a", 1)
-    lines = _lines(tmp_path / "a")
     path = tmp_path / "a"
+    _filled(path, 1)
+    _add_bytes(path, b'{"action":')
+    _filled(path, 1)
     assert verify(path).torn == (2,)
-    flaws = _judge([lines[0], *lines[2:]]).flaws
-    assert [flaw.flaw for flaw in flaws] == [Flaw.EDITED]
+    lines = _lines(path)
+    del lines[1]
+    (flaw,) = _judge(lines).flaws
+    assert flaw.flaw is Flaw.EDITED
 
 
 @pytest.mark.parametrize("strange", [[1], {"a": 1}, None, "1", 1.5])
@@ -500,7 +542,7 @@ def test_details_of_another_program_are_no_error(tmp_path: Path, strange: object
     path = tmp_path / "a"
     foreign_details = {"sha256_before": strange, "sha256_after": strange, "begun": strange}
     for action in (AuditAction.APPLY_BEGUN, AuditAction.APPLIED, AuditAction.APPLY_BEGUN):
-        append(path, action, at=NOW, who="", subject="x", details=foreign_details)
+        _append(path, action, "x", foreign_details, who="")
     verdict = verify(path)
     assert verdict.holds
     assert len(verdict.open_writes) == 2
@@ -511,8 +553,13 @@ def test_an_entry_that_the_system_takes_in_parts_is_written_whole(
 ) -> None:
     path = tmp_path / "audit.jsonl"
     write = os.write
-    monkeypatch.setattr(os, "write", lambda descriptor, data: write(descriptor, bytes(data)[:7]))
-    made = append(path, AuditAction.PROPOSED, at=NOW, who="me", subject="cell", details={"n": 1})
+
+    def seven_bytes(descriptor: int, data: bytes) -> int:
+        part = bytes(data)[:7]
+        return write(descriptor, part)
+
+    monkeypatch.setattr(os, "write", seven_bytes)
+    made = _append(path, AuditAction.PROPOSED, "cell", {"n": 1}, who="me")
     monkeypatch.undo()
     assert read(path) == (made,)
     assert verify(path).holds
@@ -523,7 +570,7 @@ def test_an_entry_that_is_taken_in_part_fails_with_the_cause_of_the_rest(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int
 ) -> None:
     path = tmp_path / "audit.jsonl"
-    first = append(path, AuditAction.PROPOSED, at=NOW, who="me", subject="cell", details={"n": 1})
+    first = _append(path, AuditAction.PROPOSED, "cell", {"n": 1}, who="me")
     write = os.write
     calls: list[int] = []
 
@@ -531,15 +578,16 @@ def test_an_entry_that_is_taken_in_part_fails_with_the_cause_of_the_rest(
         calls.append(descriptor)
         if len(calls) > 1:
             raise OSError(number, os.strerror(number))
-        return write(descriptor, bytes(data)[:20])
+        part = bytes(data)[:20]
+        return write(descriptor, part)
 
     monkeypatch.setattr(os, "write", short)
     with pytest.raises(OSError, match=os.strerror(number)) as caught:
-        append(path, AuditAction.WRITE_FOUND, at=NOW, who="me", subject="cell", details={"n": 2})
+        _append(path, AuditAction.WRITE_FOUND, "cell", {"n": 2}, who="me")
     monkeypatch.undo()
     assert caught.value.errno == number
     # The unfinished line is reported by the next entry, and the chain holds.
-    append(path, AuditAction.WRITE_FOUND, at=NOW, who="me", subject="cell", details={"n": 2})
+    _append(path, AuditAction.WRITE_FOUND, "cell", {"n": 2}, who="me")
     entries = read(path)
     assert entries[0] == first
     actions = [one.action for one in entries[1:]]

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import struct
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -40,7 +41,37 @@ FUZZ = settings(
     database=None,
     suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
-BITS64, BITS32, BITS16 = (st.integers(0, 2**bits - 1) for bits in (64, 32, 16))
+BITS64 = st.integers(0, 2**64 - 1)
+BITS32 = st.integers(0, 2**32 - 1)
+BITS16 = st.integers(0, 2**16 - 1)
+COUNTS = ("positions", "currents", "statuswords")  #: fields with the lengths of a sample's arrays
+#: Metadata of two axes
+TWO_AXES = (
+    b'{"axes": [{"name": "J1", "current_per_unit": 1}, {"name": "J2", "current_per_unit": 1}]}'
+)
+
+
+def _sample_messages(count: int, axes: int) -> np.ndarray:
+    """Messages of samples as a reader expects them, their values zero."""
+    dtype = sample_dtype(axes)
+    messages = np.zeros(count, dtype=dtype)
+    messages["opcode"] = Opcode.MESSAGE
+    messages["length"] = dtype.itemsize - 9
+    messages["channel"] = 1
+    messages["encapsulation"] = 0x100
+    for name in COUNTS:
+        messages[name] = axes
+    return messages
+
+
+def _records_before_samples() -> list[bytes]:
+    """Records that a log of two axes begins with."""
+    run = run_record(content(2).run)
+    return [
+        HEADER,
+        attachment_record(READBACK, TWO_AXES),
+        metadata_record(RUN, sealed(run)),
+    ]
 
 
 @pytest.fixture(scope="module")
@@ -50,6 +81,15 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
     events = [CellEvent(START_NS, None, EventKind.MOVE_START, k, "move") for k in range(3)]
     path = tmp_path_factory.mktemp("logs") / "good.mcap"
     return write(path, content(2), rows, events)
+
+
+def _assert_same_samples(block: SampleBlock, original: Log, first: int) -> None:
+    """Check a block against the samples of the original from the first of them on."""
+    end = first + len(block.cycle)
+    for name in SampleBlock.__slots__:
+        found = getattr(block, name)
+        of_original = getattr(original.samples, name)
+        assert np.array_equal(found, of_original[first:end]), name
 
 
 def _attack(path: Path, original: Log | None) -> None:
@@ -66,9 +106,7 @@ def _attack(path: Path, original: Log | None) -> None:
     done = 0
     for block in reader.until_damage():
         if original is not None:
-            for name in SampleBlock.__slots__:
-                then = getattr(original.samples, name)[done : done + len(block.cycle)]
-                assert np.array_equal(getattr(block, name), then), name
+            _assert_same_samples(block, original, done)
         done += len(block.cycle)
     if done:
         try:
@@ -79,50 +117,74 @@ def _attack(path: Path, original: Log | None) -> None:
 
 
 def _same(one: Log, other: Log) -> bool:
-    heads = (one.head, one.events, one.statistics) == (other.head, other.events, other.statistics)
-    pairs = (
-        (getattr(one.samples, name), getattr(other.samples, name)) for name in SampleBlock.__slots__
-    )
-    return heads and all(np.array_equal(*pair) for pair in pairs)
+    for name in SampleBlock.__slots__:
+        values = getattr(one.samples, name)
+        other_values = getattr(other.samples, name)
+        if not np.array_equal(values, other_values):
+            return False
+    same_head = one.head == other.head
+    same_events = one.events == other.events
+    return same_head and same_events and one.statistics == other.statistics
 
 
-DAMAGE = st.lists(
-    st.tuples(
-        st.sampled_from(("flip", "cut", "remove", "repeat", "fill", "insert")),
-        st.floats(0.0, 1.0, exclude_max=True),
-        st.integers(0, 7),
-        st.integers(1, 600),
-        st.binary(min_size=1, max_size=40),
-    ),
-    min_size=1,
-    max_size=4,
+@dataclass(frozen=True)
+class Damage:
+    """A change of a file.
+
+    Attributes:
+        kind: of change.
+        where: its place, as a share of the file.
+        bit: that is flipped.
+        length: of what is removed, repeated or filled.
+        noise: that is inserted; its first byte fills.
+    """
+
+    kind: str
+    where: float
+    bit: int
+    length: int
+    noise: bytes
+
+    def apply(self, data: bytearray) -> None:
+        """Change the content of a file that is not empty."""
+        at = int(self.where * len(data))
+        end = at + self.length
+        match self.kind:
+            case "flip":
+                data[at] ^= 1 << self.bit
+            case "cut":
+                del data[at:]
+            case "remove":
+                del data[at:end]
+            case "repeat":
+                data[at:at] = data[at:end]
+            case "fill":
+                filled = len(data[at:end])
+                data[at:end] = self.noise[:1] * filled
+            case _:
+                data[at:at] = self.noise
+
+
+DAMAGES = st.builds(
+    Damage,
+    kind=st.sampled_from(("flip", "cut", "remove", "repeat", "fill", "insert")),
+    where=st.floats(0.0, 1.0, exclude_max=True),
+    bit=st.integers(0, 7),
+    length=st.integers(1, 600),
+    noise=st.binary(min_size=1, max_size=40),
 )
 
 
 @pytest.mark.slow
 @settings(FUZZ, max_examples=200)
-@given(DAMAGE)
-def test_no_damage_gives_other_numbers(
-    good: Path, tmp_path: Path, damage: list[tuple[str, float, int, int, bytes]]
-) -> None:
+@given(st.lists(DAMAGES, min_size=1, max_size=4))
+def test_no_damage_gives_other_numbers(good: Path, tmp_path: Path, damages: list[Damage]) -> None:
     original = read_log(good)
     data = bytearray(good.read_bytes())
-    for kind, where, bit, length, noise in damage:
-        at = int(where * len(data))
+    for damage in damages:
         if not data:
             break
-        if kind == "flip":
-            data[at] ^= 1 << bit
-        elif kind == "cut":
-            del data[at:]
-        elif kind == "remove":
-            del data[at : at + length]
-        elif kind == "repeat":
-            data[at:at] = data[at : at + length]
-        elif kind == "fill":
-            data[at : at + length] = noise[:1] * len(data[at : at + length])
-        else:
-            data[at:at] = noise
+        damage.apply(data)
     path = tmp_path / "damaged.mcap"
     path.write_bytes(data)
     _attack(path, original)
@@ -134,36 +196,64 @@ TEXTS = st.text(max_size=12) | st.sampled_from(
 
 
 @st.composite
-def _records(draw: st.DrawFn) -> bytes:
-    sampled = st.sampled_from(("any", "metadata", "attachment", "chunk", "length"))
-    kind = draw(sampled)
-    if kind == "any":
-        opcode = draw(st.integers(0, 255))
-        body = draw(st.binary(max_size=60))
-        return raw_record(opcode, body)
-    if kind == "length":
-        return raw_record(draw(st.integers(1, 15)), draw(st.binary(max_size=20)), draw(BITS64))
-    if kind == "metadata":
-        start = content(2)
-        if draw(st.booleans()):
-            base = run_record(start.run)
-        else:
-            base = {"samples": "1", "missing": "[0, 0]", "valid": "true"}
-        entries = base | draw(st.dictionaries(st.sampled_from(sorted(base)), TEXTS, max_size=3))
-        entries = sealed(entries) if draw(st.booleans()) else entries
-        return metadata_record(draw(st.sampled_from((RUN, STATISTICS))), entries)
-    if kind == "attachment":
-        data = draw(st.binary(max_size=50) | TEXTS.map(str.encode) | st.just(b"[" * 100_000))
-        return attachment_record(draw(st.sampled_from((READBACK, "cell.yaml", ""))), data)
+def _any_record(draw: st.DrawFn) -> bytes:
+    opcode = draw(st.integers(0, 255))
+    body = draw(st.binary(max_size=60))
+    return raw_record(opcode, body)
+
+
+@st.composite
+def _record_of_any_length(draw: st.DrawFn) -> bytes:
+    opcode = draw(st.integers(1, 15))
+    body = draw(st.binary(max_size=20))
+    length = draw(BITS64)
+    return raw_record(opcode, body, length)
+
+
+@st.composite
+def _metadata(draw: st.DrawFn) -> bytes:
+    if draw(st.booleans()):
+        base = run_record(content(2).run)
+    else:
+        base = {"samples": "1", "missing": "[0, 0]", "valid": "true"}
+    keys = st.sampled_from(sorted(base))
+    changes = draw(st.dictionaries(keys, TEXTS, max_size=3))
+    entries = base | changes
+    if draw(st.booleans()):
+        entries = sealed(entries)
+    name = draw(st.sampled_from((RUN, STATISTICS)))
+    return metadata_record(name, entries)
+
+
+@st.composite
+def _attachment(draw: st.DrawFn) -> bytes:
+    encoded_texts = TEXTS.map(str.encode)
+    deep = st.just(b"[" * 100_000)
+    data = draw(st.binary(max_size=50) | encoded_texts | deep)
+    name = draw(st.sampled_from((READBACK, "cell.yaml", "")))
+    return attachment_record(name, data)
+
+
+@st.composite
+def _chunk(draw: st.DrawFn) -> bytes:
     size = draw(st.none() | BITS64)
-    return chunk_record(
-        draw(st.binary(max_size=80)), size, draw(st.sampled_from(("zstd", "", "lz4", "\0")))
-    )
+    data = draw(st.binary(max_size=80))
+    compression = draw(st.sampled_from(("zstd", "", "lz4", "\0")))
+    return chunk_record(data, size, compression)
+
+
+RECORDS = st.one_of(
+    _any_record(),
+    _metadata(),
+    _attachment(),
+    _chunk(),
+    _record_of_any_length(),
+)
 
 
 @pytest.mark.slow
 @settings(FUZZ, max_examples=200)
-@given(st.lists(_records(), max_size=5))
+@given(st.lists(RECORDS, max_size=5))
 def test_records_made_up_with_right_checksums_are_read_or_named(
     tmp_path: Path, records: list[bytes]
 ) -> None:
@@ -172,43 +262,49 @@ def test_records_made_up_with_right_checksums_are_read_or_named(
     _attack(path, None)
 
 
+def _sample(draw: st.DrawFn, channel: int) -> bytes:
+    axes = draw(st.integers(1, 3))
+    message = _sample_messages(1, axes)
+    message["channel"] = channel
+    message["encapsulation"] = draw(st.sampled_from((0x100, 0x100, 0)))
+    for name in COUNTS:
+        message[name] = draw(st.sampled_from((axes, axes, axes, 2**32 - 1)))
+    message["cycle"] = draw(BITS64)
+    message["nanoseconds"] = draw(BITS32)
+    message["seconds"] = draw(st.integers(-(2**31), 2**31 - 1))
+    message["missing"] = draw(BITS32)
+    return message.tobytes()
+
+
+def _event_data(draw: st.DrawFn) -> bytes:
+    """An event, in CDR."""
+    words = draw(st.sampled_from(("emcy", "stop", "nonsense", "")))
+    length = draw(st.sampled_from((len(words) + 1, 0, 2**32 - 1)))
+    seconds = draw(st.integers(-5, 5))
+    nanoseconds = draw(BITS32)
+    axis = draw(st.integers(-2, 40))
+    body = struct.pack("<4siIh2x", b"\0\1\0\0", seconds, nanoseconds, axis)
+    packed_length = struct.pack("<I", length)
+    rest = draw(st.binary(max_size=20))
+    return body + packed_length + words.encode() + b"\0" + rest
+
+
 @st.composite
 def _messages(draw: st.DrawFn) -> bytes:
-    sampled = st.sampled_from(("sample", "event", "any"))
-    kind = draw(sampled)
+    kinds = st.sampled_from(("sample", "event", "any"))
+    kind = draw(kinds)
     channel = draw(st.sampled_from((1, 1, 2, 2, 3)))
     if kind == "sample":
-        axes = draw(st.integers(1, 3))
-        record = np.zeros(1, dtype=sample_dtype(axes))
-        itemsize = sample_dtype(axes).itemsize
-        record["opcode"], record["length"], record["channel"] = (
-            Opcode.MESSAGE,
-            itemsize - 9,
-            channel,
-        )
-        record["encapsulation"] = draw(st.sampled_from((0x100, 0x100, 0)))
-        for name in ("positions", "currents", "statuswords"):
-            record[name] = draw(st.sampled_from((axes, axes, axes, 2**32 - 1)))
-        record["cycle"], record["nanoseconds"] = draw(BITS64), draw(BITS32)
-        record["seconds"], record["missing"] = draw(st.integers(-(2**31), 2**31 - 1)), draw(BITS32)
-        return record.tobytes()
+        return _sample(draw, channel)
     if kind == "event":
-        words = draw(st.sampled_from(("emcy", "stop", "nonsense", "")))
-        length = draw(st.sampled_from((len(words) + 1, 0, 2**32 - 1)))
-        body = struct.pack(
-            "<4siIh2x",
-            b"\0\1\0\0",
-            draw(st.integers(-5, 5)),
-            draw(BITS32),
-            draw(st.integers(-2, 40)),
-        )
-        packed = struct.pack("<I", length)
-        data = body + packed + words.encode() + b"\0" + draw(st.binary(max_size=20))
+        data = _event_data(draw)
     else:
         data = draw(st.binary(max_size=60))
-    head = struct.pack("<HIQQ", channel, 0, draw(BITS64), draw(BITS64))
-    head_body = head + data
-    return raw_record(Opcode.MESSAGE, head_body, draw(st.none() | st.none() | BITS16))
+    logged_ns = draw(BITS64)
+    published_ns = draw(BITS64)
+    head = struct.pack("<HIQQ", channel, 0, logged_ns, published_ns)
+    length = draw(st.none() | st.none() | BITS16)
+    return raw_record(Opcode.MESSAGE, head + data, length)
 
 
 @pytest.mark.slow
@@ -218,10 +314,6 @@ def _messages(draw: st.DrawFn) -> bytes:
 def test_messages_made_up_in_genuine_chunks_are_read_or_named(
     tmp_path: Path, messages: list[bytes], defined: bool, count: str
 ) -> None:
-    start = content(2)
-    readback = (
-        b'{"axes": [{"name": "J1", "current_per_unit": 1}, {"name": "J2", "current_per_unit": 1}]}'
-    )
     statistics = {
         "samples": count,
         "lost_cycles": "0",
@@ -229,13 +321,12 @@ def test_messages_made_up_in_genuine_chunks_are_read_or_named(
         "valid": "true",
         "reason": "",
     }
-    before = [
-        HEADER,
-        attachment_record(READBACK, readback),
-        metadata_record(RUN, sealed(run_record(start.run))),
-    ]
-    chunk = chunk_record((TOPICS if defined else b"") + b"".join(messages))
-    records = [*before, chunk, metadata_record(STATISTICS, sealed(statistics))]
+    topics = b""
+    if defined:
+        topics = TOPICS
+    chunk = chunk_record(topics + b"".join(messages))
+    end = metadata_record(STATISTICS, sealed(statistics))
+    records = [*_records_before_samples(), chunk, end]
     made_path = tmp_path / "made.mcap"
     path = finished_file(made_path, records)
     _attack(path, None)
@@ -244,31 +335,12 @@ def test_messages_made_up_in_genuine_chunks_are_read_or_named(
 def test_the_made_up_files_are_ones_that_a_reader_takes(good: Path, tmp_path: Path) -> None:
     """So that the tests above reach the parsers: without a false byte such a file is a log."""
     log = read_log(good)
-    start = content(2)
-    record = np.zeros(1, dtype=sample_dtype(2))
-    for name, value in (
-        ("opcode", 5),
-        ("length", record.itemsize - 9),
-        ("channel", 1),
-        ("encapsulation", 0x100),
-    ):
-        record[name] = value
-    for name in ("positions", "currents", "statuswords"):
-        record[name] = 2
-    statistics = sealed({**statistics_record(log.statistics), "samples": "1", "missing": "[0, 0]"})
-    readback = (
-        b'{"axes": [{"name": "J1", "current_per_unit": 1}, {"name": "J2", "current_per_unit": 1}]}'
-    )
-    before = [
-        HEADER,
-        attachment_record(READBACK, readback),
-        metadata_record(RUN, sealed(run_record(start.run))),
-    ]
-    made = [
-        *before,
-        chunk_record(TOPICS + record.tobytes()),
-        metadata_record(STATISTICS, statistics),
-    ]
+    sample = _sample_messages(1, axes=2)
+    chunk = chunk_record(TOPICS + sample.tobytes())
+    statistics = statistics_record(log.statistics)
+    of_one_sample = {**statistics, "samples": "1", "missing": "[0, 0]"}
+    end = metadata_record(STATISTICS, sealed(of_one_sample))
+    made = [*_records_before_samples(), chunk, end]
     made_path = tmp_path / "made.mcap"
     path = finished_file(made_path, made)
     cycle = read_log(path).samples.cycle
@@ -276,12 +348,13 @@ def test_the_made_up_files_are_ones_that_a_reader_takes(good: Path, tmp_path: Pa
 
 
 def _is_open(path: Path) -> bool:
-    """Whether this process holds a file open."""
-    held: list[str] = []
+    """Whether this process has a file open."""
+    open_files: list[str] = []
     for entry in Path("/proc/self/fd").iterdir():
         with suppress(OSError):  # that of the listing itself is closed
-            held.append(str(entry.readlink()))
-    return str(path) in held
+            target = entry.readlink()
+            open_files.append(str(target))
+    return str(path) in open_files
 
 
 def test_a_log_is_closed_although_its_error_is_kept(tmp_path: Path) -> None:
@@ -291,35 +364,33 @@ def test_a_log_is_closed_although_its_error_is_kept(tmp_path: Path) -> None:
         writer = McapWriter(stream)
         writer.start(profile="of another program")
         writer.finish()
-    with pytest.raises(LogUnreadable) as kept:
+    with pytest.raises(LogUnreadable) as caught:
         read_log(path)
     assert not _is_open(path)
     reader = LogReader(path)
-    assert [*reader.until_damage()] == []
+    blocks = list(reader.until_damage())
+    assert blocks == []
     assert reader.damage is not None
     assert not _is_open(path)
-    assert kept.value is not None
+    assert caught.value is not None
 
 
 def test_a_small_file_cannot_take_much_memory(tmp_path: Path) -> None:
     """Each chunk keeps its own bound; together they keep one that goes with the size of the
     file.
     """
-    record = np.zeros(500_000, dtype=sample_dtype(2))
-    itemsize = sample_dtype(2).itemsize
-    for name, value in (("opcode", 5), ("length", itemsize - 9), ("channel", 1)):
-        record[name] = value
-    record["encapsulation"] = 0x100
-    for name in ("positions", "currents", "statuswords"):
-        record[name] = 2
-    chunk = chunk_record(record.tobytes())
-    assert len(chunk) * 200 < record.nbytes
-    tobytes = record[:1].tobytes()
-    records = [HEADER, chunk_record(TOPICS + tobytes), *[chunk] * 8]
+    messages = _sample_messages(500_000, axes=2)
+    chunk = chunk_record(messages.tobytes())
+    assert len(chunk) * 200 < messages.nbytes
+    first_message = messages[:1].tobytes()
+    with_topics = chunk_record(TOPICS + first_message)
+    records = [HEADER, with_topics, *[chunk] * 8]
     bomb_path = tmp_path / "bomb.mcap"
     path = finished_file(bomb_path, records)
     taken = 0
     with pytest.raises(LogUnreadable, match="times the file"):
         for block in LogReader(path):
             taken += len(block.cycle)
-    assert taken * sample_dtype(2).itemsize <= 64 * 2**20 + 200 * path.stat().st_size
+    taken_bytes = taken * messages.itemsize
+    limit_bytes = 64 * 2**20 + 200 * path.stat().st_size
+    assert taken_bytes <= limit_bytes

@@ -5,7 +5,7 @@ wherever the log is read or called valid.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from math import radians
 from pathlib import Path
 from typing import Any
@@ -43,38 +43,66 @@ RATE_HZ = 1000.0
 AXES = 6
 GLITCH_RAD = 0.9
 CELL = load_cell(CHECKOUT / "configs/cells/demo.yaml")
-REST_RAD = np.array([0.0, 0.0, radians(60.0), 0.0, 0.0, 0.0])  # the elbow's limits leave zero out
+REST_RAD = np.zeros(AXES)
+REST_RAD[2] = radians(60.0)  # the elbow's limits leave zero out
 
 
 def _joints(*, resting: int | None = None) -> FloatArray:
     """Smooth motion of every joint within its limits [rad], shape (COUNT, AXES); one may rest."""
     time_s = np.arange(COUNT) / RATE_HZ
-    joint_rad = REST_RAD + 0.2 * np.sin(2.0 * np.pi * 0.5 * time_s[:, None] + np.arange(AXES))
+    wave = np.pi * time_s
+    phase = wave[:, None] + np.arange(AXES)
+    joint_rad = REST_RAD + 0.2 * np.sin(phase)
     if resting is not None:
         joint_rad[:, resting] = REST_RAD[resting]
     return joint_rad
 
 
-def _samples(joint_rad: FloatArray, missing: Callable[[int], int] = lambda _: 0) -> list[Sample]:
+def _rounded(values: FloatArray) -> list[list[int]]:
+    """Nearest integers, row by row."""
+    rows: list[list[int]] = np.rint(values).astype(np.int64).tolist()
+    return rows
+
+
+def _none_missing(_: int) -> int:
+    return 0
+
+
+def _samples(joint_rad: FloatArray, missing: Callable[[int], int] = _none_missing) -> list[Sample]:
     """Samples of the demo cell at these positions, with a smooth current."""
-    motor_rad = joint_rad @ CELL.ratio.T
-    counts = np.rint(motor_rad / (2.0 * np.pi) * 65536).astype(np.int64).tolist()
-    current = (
-        np.rint(200.0 * np.cos(np.arange(COUNT)[:, None] / 90.0 + np.arange(AXES)))
-        .astype(np.int64)
-        .tolist()
-    )
-    return [
-        Sample(
-            10 + k,
-            START_NS + k * 1_000_000,
-            tuple(counts[k]),
-            tuple(current[k]),
-            (0x1237,) * AXES,
-            missing(k),
+    motor_turns = joint_rad @ CELL.ratio.T / (2.0 * np.pi)
+    counts = _rounded(65536 * motor_turns)
+    wave = np.arange(COUNT) / 90.0
+    phase = wave[:, None] + np.arange(AXES)
+    current = _rounded(200.0 * np.cos(phase))
+    samples = []
+    for k in range(COUNT):
+        sample = Sample(
+            cycle=10 + k,
+            time_ns=START_NS + k * 1_000_000,
+            position_counts=tuple(counts[k]),
+            current_raw=tuple(current[k]),
+            statusword=(0x1237,) * AXES,
+            missing=missing(k),
         )
-        for k in range(COUNT)
-    ]
+        samples.append(sample)
+    return samples
+
+
+def _verdict_while_recording(rows: list[Sample]) -> str:
+    """Why the recorder calls samples invalid; empty where they are valid."""
+    recorded = RecordedMotion(AXES)
+    for row in rows:
+        recorded.take(row)
+    axes = [AxisReadback(name, 0.002) for name in CELL.axis_names]
+    readback = Readback(tuple(axes))
+    return recorded.reason(CELL, readback, RATE_HZ)
+
+
+def _said(capsys: pytest.CaptureFixture[str]) -> str:
+    """What was printed to standard error, in one line."""
+    printed = capsys.readouterr().err
+    return " ".join(printed.split())
 
 
 def _glitch(rows: slice, axis: int = 1) -> Callable[[FloatArray], None]:
@@ -84,15 +112,24 @@ def _glitch(rows: slice, axis: int = 1) -> Callable[[FloatArray], None]:
     return change
 
 
-GLITCHES: dict[str, tuple[int | None, Callable[[FloatArray], None], str]] = {
-    "one sample": (None, _glitch(slice(1500, 1501)), "at 1.5 s"),
-    "the first sample": (None, _glitch(slice(0, 1)), "at 0.001 s"),
-    "the last sample": (None, _glitch(slice(-1, None)), "at 4.999 s"),
-    "a run of wrong samples": (None, _glitch(slice(1500, 1507)), "at 1.5"),
-    "a step that stays": (None, _glitch(slice(1500, None)), "at 1.5 s"),
-    "one sample of an axis that rests": (1, _glitch(slice(1500, 1501)), "at 1.5"),
-    "a step of an axis that rests": (1, _glitch(slice(1500, None)), "at 1.5 s"),
-    "between two blocks": (None, _glitch(slice(4096, 4097)), "at 4.09"),
+@dataclass(frozen=True)
+class Glitch:
+    """A change of the recorded positions of J2, or of it at rest, and its time in the message."""
+
+    change: Callable[[FloatArray], None]
+    when: str
+    resting: int | None = None
+
+
+GLITCHES = {
+    "one sample": Glitch(_glitch(slice(1500, 1501)), "at 1.5 s"),
+    "the first sample": Glitch(_glitch(slice(0, 1)), "at 0.001 s"),
+    "the last sample": Glitch(_glitch(slice(-1, None)), "at 4.999 s"),
+    "a run of wrong samples": Glitch(_glitch(slice(1500, 1507)), "at 1.5"),
+    "a step that stays": Glitch(_glitch(slice(1500, None)), "at 1.5 s"),
+    "one sample of an axis that rests": Glitch(_glitch(slice(1500, 1501)), "at 1.5", resting=1),
+    "a step of an axis that rests": Glitch(_glitch(slice(1500, None)), "at 1.5 s", resting=1),
+    "between two blocks": Glitch(_glitch(slice(4096, 4097)), "at 4.09"),
 }
 
 
@@ -105,43 +142,44 @@ def _log(path: Path, rows: list[Sample]) -> Path:
 def test_a_glitch_of_the_encoder_is_refused_and_called_invalid_by_all(
     kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    resting, change, when = GLITCHES[kind]
-    joint_rad = _joints(resting=resting)
+    glitch = GLITCHES[kind]
+    joint_rad = _joints(resting=glitch.resting)
     path = tmp_path / "sound.mcap"
     sound = _log(path, _samples(joint_rad))
     load_run(sound)
     assert info_report(sound).valid
-    change(joint_rad)
+    glitch.change(joint_rad)
     rows = _samples(joint_rad)
     a_path = tmp_path / "a.mcap"
     log = _log(a_path, rows)
+
     with pytest.raises(PositionImplausible) as refused:
         load_run(log)
+
     assert refused.value.subject == f"{log}, axis J2"
     assert "deg in one sample, 51" in refused.value.found  # 0.9 rad in 1 ms
-    assert when in refused.value.found
+    assert glitch.when in refused.value.found
     assert refused.value.expected == (
         "at most 600 deg/s, 3 times 200 deg/s, the limit in the cell configuration"
     )
     reason = f"axis J2: {refused.value.found}"
     described = info_report(log)
-    assert (described.valid, described.reason) == (False, reason)
+    assert not described.valid
+    assert described.reason == reason
     table = export_log(log, tmp_path / "a.csv", TableFormat.CSV)
+    assert not table.valid
+    assert table.reason == reason
     bag = export_bag(log, tmp_path / "bag")
-    expected = (False, reason, False, reason)
-    assert (table.valid, table.reason, bag.valid, bag.reason) == expected
-    recorded = RecordedMotion(AXES)
-    for row in rows:
-        recorded.take(row)
-    axes = tuple(AxisReadback(name, 0.002) for name in CELL.axis_names)
-    readback = Readback(axes)
-    assert recorded.reason(CELL, readback, RATE_HZ) == reason
+    assert not bag.valid
+    assert bag.reason == reason
+    assert _verdict_while_recording(rows) == reason
+
     damaged = log.rename(tmp_path / "b.mcap.part")
     saved = salvage(damaged, tmp_path / "saved.mcap")
-    assert (saved.statistics.valid, saved.statistics.reason) == (False, reason)
+    assert not saved.statistics.valid
+    assert saved.statistics.reason == reason
     assert main(["fit", str(sound), str(saved.log)]) == ExitCode.DATA_UNFIT
-    error_output = capsys.readouterr().err
-    assert "axis J2: a step of" in " ".join(error_output.split())
+    assert "axis J2: a step of" in _said(capsys)
 
 
 @pytest.mark.parametrize("verb", ["fit", "residual", "validate", "weigh", "contact"])
@@ -157,8 +195,7 @@ def test_every_verb_refuses_a_glitch(
     else:
         arguments = [str(full_calibration), log]
     assert main([verb, *arguments]) == ExitCode.DATA_UNFIT
-    error_output = capsys.readouterr().err
-    said = " ".join(error_output.split())
+    said = _said(capsys)
     assert "a step of" in said
     assert "axis J2" in said
 
@@ -180,10 +217,12 @@ def test_a_glitch_that_no_limit_rules_out_is_filled_in_and_the_log_valid(tmp_pat
     sound = _differentiated(sound_run, cell)
     data = _differentiated(run, cell)
     (fault,) = data.faults
-    expected = (FaultKind.GLITCH, ChannelKind.POSITION, 1)
-    assert (fault.kind, fault.quantity, fault.axis) == expected
+    assert fault.kind is FaultKind.GLITCH
+    assert fault.quantity is ChannelKind.POSITION
+    assert fault.axis == 1
     assert fault.stretches.tolist() == [[1500, 1503]]
-    assert fault.size == pytest.approx(SMALL_GLITCH_RAD * CELL.ratio[1, 1], rel=0.01)
+    size_rad = SMALL_GLITCH_RAD * CELL.ratio[1, 1]
+    assert fault.size == pytest.approx(size_rad, rel=0.01)
     assert sound.faults == ()
     position_difference_rad = data.position_rad - sound.position_rad
     assert np.abs(position_difference_rad).max() < 1e-4
@@ -220,44 +259,27 @@ def test_a_log_that_a_fit_refuses_is_called_invalid_by_all(kind: str, tmp_path: 
     rows = _samples(joint_rad)
     current = np.array([row.current_raw for row in rows])
     FAULTS[kind](joint_rad, current)
-    moved = _samples(joint_rad)
-    rows = [
-        replace(row, current_raw=tuple(own))
-        for row, own in zip(moved, current.tolist(), strict=True)
-    ]
+    rows = []
+    for moved, of_axes in zip(_samples(joint_rad), current.tolist(), strict=True):
+        row = replace(moved, current_raw=tuple(of_axes))
+        rows.append(row)
     path = tmp_path / "a.mcap"
     log = _log(path, rows)
     with pytest.raises(DataError) as refused:
         load_run(log)
     assert refused.value.subject == f"{log}, axis J2"
     described = info_report(log)
-    recorded = RecordedMotion(AXES)
-    for row in rows:
-        recorded.take(row)
-    axes = tuple(AxisReadback(name, 0.002) for name in CELL.axis_names)
-    readback = Readback(axes)
     reason = f"axis J2: {refused.value.found}"
-    assert (described.valid, described.reason) == (False, reason)
-    assert recorded.reason(CELL, readback, RATE_HZ) == reason
+    assert not described.valid
+    assert described.reason == reason
+    assert _verdict_while_recording(rows) == reason
 
 
 def test_a_current_that_no_amplifier_sets_is_refused_and_called_invalid(tmp_path: Path) -> None:
     rows = _samples(_joints())
-    (first, *others) = rows[1000].current_raw
-    current_raw = (2**30, *others)
-    statusword = (0x1237,) * AXES
-    cycle = rows[1000].cycle
-    time_ns = rows[1000].time_ns
-    position_counts = rows[1000].position_counts
-    rows[1000] = Sample(
-        cycle,
-        time_ns,
-        position_counts,
-        current_raw,
-        statusword,
-        0,
-    )
+    first, *others = rows[1000].current_raw
     assert abs(first) <= 200
+    rows[1000] = replace(rows[1000], current_raw=(2**30, *others))
     path = tmp_path / "a.mcap"
     log = _log(path, rows)
     with pytest.raises(
@@ -279,17 +301,23 @@ def test_a_short_motion_after_a_long_rest_is_no_outlier() -> None:
     current[100, 1] = 1500.0
     found = impossible_current(current)
     assert found is not None
-    assert (found.axis, found.row) == (1, 100)
+    assert found.axis == 1
+    assert found.row == 100
 
 
 def test_answers_that_are_missing_are_no_steps(tmp_path: Path) -> None:
     """Where an axis did not answer, a log has a number that means nothing;
     the next answer is some periods away.
     """
+
+    def missing(k: int) -> int:
+        if 1500 <= k < 1540:
+            return 0b10
+        return 0
+
     joint_rad = _joints()
-    gap = range(1500, 1540)
     joint_rad[1500:1540, 1] = 0.0
-    rows = _samples(joint_rad, lambda k: 2 if k in gap else 0)
+    rows = _samples(joint_rad, missing)
     path = tmp_path / "a.mcap"
     log = write(path, demo_content(CHECKOUT), rows, verdict=(False, "40 missing answers"))
     run, _ = load_run(log, lossy=LossyLogs.ACCEPTED)
@@ -298,28 +326,25 @@ def test_answers_that_are_missing_are_no_steps(tmp_path: Path) -> None:
     # 22 mrad for each of the 41 periods are too fast all the same
     joint_rad[1540:, 1] += GLITCH_RAD
     b_path = tmp_path / "b.mcap"
-    wrong = write(
-        b_path,
-        demo_content(CHECKOUT),
-        _samples(joint_rad, lambda k: 2 if k in gap else 0),
-        verdict=(False, "40 missing answers"),
-    )
+    wrong_rows = _samples(joint_rad, missing)
+    verdict = (False, "40 missing answers")
+    wrong = write(b_path, demo_content(CHECKOUT), wrong_rows, verdict=verdict)
     with pytest.raises(PositionImplausible, match="in one sample"):
         load_run(wrong, lossy=LossyLogs.ACCEPTED)
 
 
 def test_a_counter_that_wraps_at_32_bits_is_no_step() -> None:
     joint_rad = _joints()
-    recorded = RecordedMotion(AXES)
+    rows = []
     for row in _samples(joint_rad):
         # The counter of the first motor begins just below its end.
-        first = (row.position_counts[0] + 2**31 - 10) % 2**32
-        signed = first - 2**32 if first >= 2**31 else first
-        position_counts = (signed, *row.position_counts[1:])
-        recorded.take(replace(row, position_counts=position_counts))
-    axes = tuple(AxisReadback(name, 0.002) for name in CELL.axis_names)
-    readback = Readback(axes)
-    assert recorded.reason(CELL, readback, RATE_HZ) == ""
+        first, *others = row.position_counts
+        counter = (first + 2**31 - 10) % 2**32
+        if counter >= 2**31:
+            counter -= 2**32
+        wrapped = replace(row, position_counts=(counter, *others))
+        rows.append(wrapped)
+    assert _verdict_while_recording(rows) == ""
 
 
 def test_a_coarse_encoder_that_hardly_moves_has_no_glitch() -> None:
@@ -330,7 +355,8 @@ def test_a_coarse_encoder_that_hardly_moves_has_no_glitch() -> None:
     joint_rad[1000:2000, 0] = 1.0
     found = impossible_step(joint_rad, RATE_HZ, CELL)
     assert found is not None
-    assert (found.axis, found.row) == (0, 1000)
+    assert found.axis == 0
+    assert found.row == 1000
 
 
 def test_an_import_and_a_recording_are_judged_by_one_function(

@@ -74,7 +74,8 @@ class Reader(HTMLParser):
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         for name, _ in attrs:
-            assert not (name in {"src", "href"} or name.startswith("on"))
+            assert name not in {"src", "href"}
+            assert not name.startswith("on")
         self.tags.append(tag)
         if tag != "meta":
             self.open.append(tag)
@@ -90,19 +91,58 @@ def _with_smooth() -> Calibration:
     """A term without a name on J2: its torque is that of the B-splines alone."""
     smooth = Smooth(Abscissa.POSITION, lower=-2.38838, upper=1.5)
     placed = PlacedEffect(smooth, 1)
-    found = tuple(
-        Parameter(c.name, 0.1 * k - 0.3, 0.02, c.unit) for k, c in enumerate(placed.columns)
-    )
+    found = []
+    for k, column in enumerate(placed.columns):
+        coefficient = Parameter(column.name, 0.1 * k - 0.3, 0.02, column.unit)
+        found.append(coefficient)
     settings = dict(placed.effect.settings)
-    effect = AcceptedEffect(placed.effect.name, "J2", settings, found, 5.0, 3.0)
+    effect = AcceptedEffect(placed.effect.name, "J2", settings, tuple(found), 5.0, 3.0)
     made = demo_calibration()
     parameters = (*made.parameters, *found)
     return replace(made, effects=(effect,), parameters=parameters)
 
 
+def _certified(calibration: Calibration) -> Certificate:
+    """The certificate of a calibration that no controller is compared with."""
+    comparison = without_controller(calibration, "", NOW)
+    return certify(calibration, comparison)
+
+
 def _page(calibration: Calibration, earlier: Calibration | None = None) -> str:
     comparison = without_controller(calibration, "not read", NOW)
-    return certificate_page(certify(calibration, comparison, earlier))
+    certificate = certify(calibration, comparison, earlier)
+    return certificate_page(certificate)
+
+
+def _texts(calibration: Calibration, earlier: Calibration | None = None) -> list[str]:
+    """Texts of the page."""
+    page = Reader(_page(calibration, earlier))
+    return page.texts
+
+
+def _texts_of(certificate: Certificate) -> list[str]:
+    """Texts of the page of a certificate."""
+    page = Reader(certificate_page(certificate))
+    return page.texts
+
+
+def _texts_with(start: str, texts: list[str]) -> list[str]:
+    """Those that start so."""
+    return [text for text in texts if text.startswith(start)]
+
+
+def _printed_document(capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
+    """The JSON document that was printed."""
+    printed = capsys.readouterr().out
+    document: dict[str, Any] = json.loads(printed)
+    return document
+
+
+def _with_first_gain(calibration: Calibration, **changes: Any) -> Calibration:
+    """The calibration with changes of the gain of J1."""
+    first, *others = calibration.gains
+    changed = replace(first, **changes)
+    return replace(calibration, gains=(changed, *others))
 
 
 def test_every_number_of_the_document_is_on_the_page() -> None:
@@ -112,12 +152,15 @@ def test_every_number_of_the_document_is_on_the_page() -> None:
     text = certificate_page(certificate)
     report = certificate_report(certificate)
     page = Reader(text)
-    assert not set(page.tags) & {"script", "link", "iframe", "object", "a", "img"}
+    active_tags = {"script", "link", "iframe", "object", "a", "img"}
+    assert active_tags.isdisjoint(page.tags)
     assert "http" not in text.replace("http-equiv", "")
     assert f"• {report.sentence}" in page.texts
     for gain, axis in zip(calibration.gains, report.axes, strict=True):
         identified = f"{with_deviation(gain.value, gain.std)} {gain.unit}"
-        assert {f"{axis.old:.5g}", identified, axis.verdict} <= set(page.texts)
+        assert f"{axis.old:.5g}" in page.texts
+        assert identified in page.texts
+        assert axis.verdict in page.texts
         assert axis.change_percent == pytest.approx(gain.change_percent)
     before = report.nameplate_holdout_error_percent
     after = report.holdout_error_percent
@@ -134,7 +177,7 @@ def test_every_number_of_the_document_is_on_the_page() -> None:
 
 def test_the_mass_is_shown_as_it_was_entered_twice_and_what_is_missing_is_said() -> None:
     calibration = with_recordings(demo_calibration(), operator="Ada")
-    texts = Reader(_page(calibration)).texts
+    texts = _texts(calibration)
     entered = "disc: 4.59 kg in the cell file, 4.592 and 4.588 kg on the scale"
     assert (
         f"{entered}; a wrong mass changes every gain, by the same share where nothing else of "
@@ -142,54 +185,53 @@ def test_the_mass_is_shown_as_it_was_entered_twice_and_what_is_missing_is_said()
     ) in texts
     assert "Ada" in texts
     bare = replace(calibration, sources=(), holdout_error_percent=None, effects=())
-    texts = Reader(_page(bare)).texts
+    texts = _texts(bare)
     assert "not known: the recordings name none" in texts
-    assert any("No run was held out" in text for text in texts)
+    without_held_out = [text for text in texts if "No run was held out" in text]
+    assert without_held_out != []
     assert "The calibration holds no effect beyond the declared model." in texts
 
 
 def test_the_dependence_of_the_gains_on_the_mass_is_on_the_sheet_and_in_the_details() -> None:
     calibration = with_recordings(demo_calibration(), operator="Ada")
     gains = calibration.gains
-    alike = PayloadMass.of("disc", 4.59, [gain.value / 4.59 for gain in gains], gains).weighed_to(
-        0.0459
-    )
-    changed_calibration = replace(calibration, payload_mass=(alike,))
-    texts = Reader(_page(changed_calibration)).texts
-    sheet = next(text for text in texts if text.startswith("disc: 4.59 kg in the cell file"))
+    per_kg = [gain.value / 4.59 for gain in gains]
+    payload = PayloadMass.of("disc", 4.59, per_kg, gains).weighed_to(0.0459)
+    in_proportion = replace(calibration, payload_mass=(payload,))
+    texts = _texts(in_proportion)
+    sheet = _texts_with("disc: 4.59 kg in the cell file", texts)[0]
     assert "if the mass of disc is wrong by 1 %, every gain is wrong by 1 %" in sheet
     assert "4.59 kg ± 0.0459 kg, which is ± 1 % of every gain, not included in σ" in sheet
     assert "Dependence of the gains on the payload's mass" in texts
-    expected = f"{gains[0].value / 4.59:.4g}"
+    expected = f"{per_kg[0]:.4g}"
     assert expected in texts
     # With the drawing known too, each gain has a number.
     shares = np.linspace(0.1, 0.6, len(gains))
-    slopes = [share * gain.value / 4.59 for share, gain in zip(shares, gains, strict=True)]
-    payload_mass = (PayloadMass.of("disc", 4.59, slopes, gains).weighed_to(0.0459),)
-    drawn = replace(calibration, payload_mass=payload_mass)
-    reader = Reader(_page(drawn))
-    sheet = next(text for text in reader.texts if text.startswith("disc: 4.59 kg in the cell file"))
+    slopes = [share * slope for share, slope in zip(shares, per_kg, strict=True)]
+    payload = PayloadMass.of("disc", 4.59, slopes, gains).weighed_to(0.0459)
+    drawn = replace(calibration, payload_mass=(payload,))
+    sheet = _texts_with("disc: 4.59 kg in the cell file", _texts(drawn))[0]
     expected = f"the gains are wrong by: {gains[0].axis} 0.10 %, "
     assert expected in sheet
     assert "which is at most ± 0.6 % of every gain, not included in σ" in sheet
-    comparison = without_controller(drawn, "", NOW)
-    certificate = certify(drawn, comparison)
+    certificate = _certified(drawn)
     report = json_tree(certificate_report(certificate))
     (found,) = report["payload_mass"]
     assert found["payload"] == "disc"
     assert found["mass_kg"] == 4.59
     assert found["tolerance_kg"] == 0.0459
-    for one, gain, share in zip(found["gains"], gains, shares, strict=True):
+    for one, gain, share, slope in zip(found["gains"], gains, shares, slopes, strict=True):
         assert one["axis"] == gain.axis
         assert one["percent_per_percent"] == pytest.approx(share)
-        assert one["per_kg"] == pytest.approx(share * gain.value / 4.59)
-        assert one["tolerance_std"] == pytest.approx(0.01 * share * abs(gain.value))
+        assert one["per_kg"] == pytest.approx(slope)
+        tolerance_std = 0.01 * share * abs(gain.value)
+        assert one["tolerance_std"] == pytest.approx(tolerance_std)
 
 
 def test_what_files_say_is_escaped() -> None:
     made = demo_calibration()
-    gains = tuple(replace(gain, axis=f"{gain.axis}{HOSTILE}") for gain in made.gains)
-    calibration = replace(made, cell=HOSTILE, gains=gains, software=HOSTILE)
+    gains = [replace(gain, axis=f"{gain.axis}{HOSTILE}") for gain in made.gains]
+    calibration = replace(made, cell=HOSTILE, gains=tuple(gains), software=HOSTILE)
     hostile = with_recordings(calibration, operator=HOSTILE)
     text = _page(hostile)
     assert "<script" not in text
@@ -199,8 +241,8 @@ def test_what_files_say_is_escaped() -> None:
 
 def test_a_calibration_of_the_library_has_no_program_and_no_time() -> None:
     calibration = replace(demo_calibration(), created="", software="")
-    text = _page(calibration)
-    assert "made time not known by software not known." in " ".join(text.split())
+    text = " ".join(_page(calibration).split())
+    assert "made time not known by software not known." in text
 
 
 def test_a_term_without_a_name_is_its_curve() -> None:
@@ -209,20 +251,22 @@ def test_a_term_without_a_name_is_its_curve() -> None:
     curve = curve_of(accepted, calibration)
     assert curve is not None
     assert curve.half_nm is None
-    expected = (-2.38838, 1.5)
-    assert (curve.x[0], curve.x[-1]) == expected
+    assert curve.x[0] == -2.38838
+    assert curve.x[-1] == 1.5
     # The shapes leave out the constant, whose B-spline weights are all one: the weights of the
     # curve sum to zero.
     placed = Smooth(Abscissa.POSITION, lower=-2.38838, upper=1.5)
-    weights = np.linalg.lstsq(placed.shapes(curve.x).T, curve.torque_nm, rcond=None)[0]
-    coefficients = calibration.effects[0].coefficients
-    assert weights == pytest.approx([one.value for one in coefficients])
+    shapes = placed.shapes(curve.x).T
+    weights, *_ = np.linalg.lstsq(shapes, curve.torque_nm, rcond=None)
+    coefficients = [one.value for one in accepted.coefficients]
+    assert weights == pytest.approx(coefficients)
+
     text = _page(calibration)
+    _, _, body = text.partition("</style>")
     for internal in ("lower", "upper", "other_axis", "signed", "part 7", "2.38838"):
-        assert internal not in text.partition("</style>")[2]
-    first_effect = calibration.effects[0]
-    texts = Reader(text).texts
-    assert size_text(first_effect, calibration) in " ".join(texts)
+        assert internal not in body
+    joined = " ".join(Reader(text).texts)
+    assert size_text(accepted, calibration) in joined
 
 
 def test_a_loss_beside_a_rotor_shows_the_inertia_of_the_rotor() -> None:
@@ -233,40 +277,35 @@ def test_a_loss_beside_a_rotor_shows_the_inertia_of_the_rotor() -> None:
     rest = Parameter("d", 0.002, 0.004, "kg m²")
     effect = LoadFriction(0, 0.58, 1)
     text = named_size(effect, (loss, rest))
-    expected = (
-        f"{with_deviation(10.0, 0.1)} % of the load torque, with a rotor of "
-        f"{with_deviation(0.6, 0.04)} kg m²"
-    )
-    assert text == expected
-    assert named_size(LoadFriction(0), (loss,)) == (
-        f"{with_deviation(10.0, 0.1)} % of the load torque"
-    )
+    share = f"{with_deviation(10.0, 0.1)} % of the load torque"
+    inertia = f"{with_deviation(0.6, 0.04)} kg m²"
+    assert text == f"{share}, with a rotor of {inertia}"
+    without_rotor = named_size(LoadFriction(0), (loss,))
+    assert without_rotor == share
 
 
 def test_the_curve_of_a_sliding_axis_is_a_force_over_metres() -> None:
     made = _with_smooth()
-    gains = tuple(replace(one, unit="N/A") if one.axis == "J2" else one for one in made.gains)
-    sliding = replace(
-        made,
-        gains=gains,
-    )
-    texts = Reader(_page(sliding)).texts
-    assert {"force [N]", "joint position [m]"} <= set(texts)
-    assert any(" N. Error of the predicted torque of J2 on data" in text for text in texts)
-    assert "torque [Nm]" in Reader(_page(made)).texts
+    gains = list(made.gains)
+    gains[1] = replace(gains[1], unit="N/A")
+    assert gains[1].axis == "J2"
+    sliding = replace(made, gains=tuple(gains))
+    texts = _texts(sliding)
+    assert "force [N]" in texts
+    assert "joint position [m]" in texts
+    in_newton = [
+        text for text in texts if " N. Error of the predicted torque of J2 on data" in text
+    ]
+    assert in_newton != []
+    assert "torque [Nm]" in _texts(made)
 
 
 def test_checks_that_failed_alike_are_one_entry_with_its_remedy() -> None:
     calibration = demo_calibration()
-    gains = tuple(replace(one, std=0.2 * abs(one.value)) for one in calibration.gains)
-    vague = replace(
-        calibration,
-        gains=gains,
-    )
-    texts = Reader(_page(vague)).texts
-    (entry,) = (
-        text for text in texts if text.startswith("J1, J2, J3, J4, J5, J6: found σ 20.00 %")
-    )
+    gains = [replace(one, std=0.2 * abs(one.value)) for one in calibration.gains]
+    vague = replace(calibration, gains=tuple(gains))
+    texts = _texts(vague)
+    (entry,) = _texts_with("J1, J2, J3, J4, J5, J6: found σ 20.00 %", texts)
     assert calibration.effects
     assert "residual" not in entry
     assert entry.endswith("record longer or more exciting moves, or a heavier payload.")
@@ -274,15 +313,13 @@ def test_checks_that_failed_alike_are_one_entry_with_its_remedy() -> None:
 
 def test_the_verdict_is_that_of_the_gates() -> None:
     calibration = demo_calibration()
-    comparison = without_controller(calibration, "", NOW)
-    assert certify(calibration, comparison).verdict is Verdict.NOT_COMPARED
-    changed_gain = replace(calibration.gains[0], std=5.0)
-    gains = (changed_gain, *calibration.gains[1:])
-    vague = replace(calibration, gains=gains)
-    refused = certify(vague, without_controller(vague, "", NOW))
+    certificate = _certified(calibration)
+    assert certificate.verdict is Verdict.NOT_COMPARED
+    vague = _with_first_gain(calibration, std=5.0)
+    refused = _certified(vague)
     assert refused.verdict is Verdict.REFUSED
     assert refused.sentence.startswith("Must not be written: J1: σ 14.75 %, expected at most 3 %")
-    assert "refused: σ 14.75 %" in Reader(certificate_page(refused)).texts
+    assert "refused: σ 14.75 %" in _texts_of(refused)
 
 
 ZERO_OFF = Diagnosis(
@@ -303,22 +340,27 @@ REVERSED = Diagnosis(
 )
 
 
+def _certified_without_refusals(calibration: Calibration) -> Certificate:
+    """The certificate of a calibration that no gate refuses."""
+    comparison = without_controller(calibration, "", NOW)
+    let_through = replace(comparison, refusals=())
+    return certify(calibration, let_through)
+
+
 def test_the_verdict_names_what_is_to_be_checked() -> None:
     calibration = replace(demo_calibration(), diagnoses=(ZERO_OFF,))
-    comparison = replace(without_controller(calibration, "", NOW), refusals=())
-    certificate = certify(calibration, comparison)
+    certificate = _certified_without_refusals(calibration)
     assert certificate.verdict is Verdict.NOT_COMPARED
     assert certificate.sentence.endswith(" But CHECK J2: the zero of J2 off by +2.00 ± 0.05 °.")
     assert "verdict act" in certificate_page(certificate)
     both = replace(calibration, diagnoses=(ZERO_OFF, REVERSED))
-    certificate = certify(both, replace(without_controller(both, "", NOW), refusals=()))
+    certificate = _certified_without_refusals(both)
     assert certificate.sentence.endswith("± 0.05 ° (and 1 more).")
 
 
 def test_a_wrong_description_that_refuses_a_write_is_said_once() -> None:
     calibration = replace(demo_calibration(), diagnoses=(REVERSED,))
-    comparison = without_controller(calibration, "", NOW)
-    certificate = certify(calibration, comparison)
+    certificate = _certified(calibration)
     assert certificate.sentence == (
         "Must not be written: J2: a position that counts the other way, expected its axis."
     )
@@ -328,11 +370,8 @@ def test_a_wrong_description_that_refuses_a_write_is_said_once() -> None:
 def test_without_a_controller_no_message_names_a_current_gain() -> None:
     calibration = demo_calibration()
     first = calibration.gains[0]
-    reversed_gain = replace(first, value=-first.value)
-    gains = (reversed_gain, *calibration.gains[1:])
-    reversed_first = replace(calibration, gains=gains)
-    comparison = without_controller(reversed_first, "", NOW)
-    certificate = certify(reversed_first, comparison)
+    reversed_first = _with_first_gain(calibration, value=-first.value)
+    certificate = _certified(reversed_first)
     (sign,) = (one for one in certificate.comparison.refusals if one.gate is Gate.SIGN)
     assert sign.found == "gain -33.9, nameplate 32.96"
     assert "current gain" not in certificate_page(certificate)
@@ -340,16 +379,10 @@ def test_without_a_controller_no_message_names_a_current_gain() -> None:
 
 def test_gains_that_were_held_are_the_first_reason() -> None:
     calibration = demo_calibration()
-    gains = tuple(replace(one, value=one.nameplate, std=0.0) for one in calibration.gains)
-    held = replace(
-        calibration,
-        gains=gains,
-    )
-    changed_effect = replace(held.effects[0], error_after_percent=6.2)
-    effects = (changed_effect,)
-    worse = replace(held, effects=effects)
-    comparison = without_controller(worse, "", NOW)
-    certificate = certify(worse, comparison)
+    gains = [replace(one, value=one.nameplate, std=0.0) for one in calibration.gains]
+    worse_effect = replace(calibration.effects[0], error_after_percent=6.2)
+    worse = replace(calibration, gains=tuple(gains), effects=(worse_effect,))
+    certificate = _certified(worse)
     assert certificate.sentence == (
         "Must not be written: the gains were held fixed (`--gains fixed`), so there is nothing "
         "to write."
@@ -361,16 +394,12 @@ def test_gains_that_were_held_are_the_first_reason() -> None:
 def test_a_page_beside_an_earlier_one_shows_what_changed() -> None:
     calibration = demo_calibration()
     first = calibration.gains[0]
-    gains = (replace(first, value=0.9 * first.value), *calibration.gains[1:])
-    earlier = replace(
-        calibration,
-        gains=gains,
-        effects=(),
-    )
-    texts = Reader(_page(calibration, earlier)).texts
+    smaller = _with_first_gain(calibration, value=0.9 * first.value)
+    earlier = replace(smaller, effects=())
+    texts = _texts(calibration, earlier)
     assert texts.count("differs from the earlier calibration") == 1
     assert "+11.1" in texts
-    assert any(text.startswith("New: J3 has friction that grows with the load") for text in texts)
+    assert _texts_with("New: J3 has friction that grows with the load", texts) != []
     changed_earlier = replace(earlier, cell="other")
     with pytest.raises(CalibrationRefused, match="of the same cell"):
         _page(calibration, changed_earlier)
@@ -386,29 +415,31 @@ def test_the_verb_writes_one_page_and_never_over_another_file(
     cell = str(cells_folder / "demo.yaml")
     code = run_verb("certificate", file, "--cell", cell, "--beside", file, "--json")
     assert code == ExitCode.OK
-    document = json.loads(capsys.readouterr().out)
+    document = _printed_document(capsys)
     # The configuration of the demo cell is not the one that the calibration names.
     assert document["verdict"] == "refused"
     expected = [f"drives.J{number}.gain" for number in range(1, 7)]
     keys = [axis["key"] for axis in document["axes"]]
     assert keys == expected
     # J4 went from -11.52 to -9.21: its size decreased. The current gain is no calibration's.
-    change_sigmas = document["axes"][3]["change_sigmas"]
-    assert change_sigmas < 0.0 < document["axes"][0]["change_sigmas"]
+    first_sigmas = document["axes"][0]["change_sigmas"]
+    fourth_sigmas = document["axes"][3]["change_sigmas"]
+    assert fourth_sigmas < 0.0 < first_sigmas
     texts = Reader(page.read_text(encoding="utf-8")).texts
     assert (
         "More than noise: the probability that noise alone makes such a change, on any axis, is "
         "below 1 %; the current gain is taken as exact on all axes."
     ) in texts
     # Of gains that must not be written the page does not show what would be.
-    assert not {axis["written"] for axis in document["axes"]} & set(texts)
+    written = {axis["written"] for axis in document["axes"]}
+    assert written.isdisjoint(texts)
     for text in texts:
         assert "would be written" not in text
     assert run_verb("certificate", file, "--json") == ExitCode.OK
-    printed = capsys.readouterr().out
-    unread = json.loads(printed)["axes"]
+    unread = _printed_document(capsys)["axes"]
     for axis in unread:
-        assert axis["key"] is axis["line"] is None
+        assert axis["key"] is None
+        assert axis["line"] is None
     assert "the nameplate is taken as exact on all axes." in page.read_text(encoding="utf-8")
     page.write_text("the user's own", encoding="utf-8")
     assert run_verb("certificate", file) == ExitCode.USAGE
@@ -458,17 +489,17 @@ def test_a_certificate_has_the_same_id_each_time_and_another_calibration_another
     other = replace(calibration, created="2025-01-02T03:04:06+00:00")
     file = tmp_path / "calibration.yaml"
     save_calibration(calibration, file)
-    names = [Origin.of(one).id for one in (calibration, calibration, other)]
-    assert names[0] == names[1] != names[2]
-    assert names[0] == sha256(file.read_bytes())[:12]
-    comparison = without_controller(calibration, "", NOW)
-    certificate = certify(calibration, comparison)
+    origin = Origin.of(calibration).id
+    assert Origin.of(calibration).id == origin
+    assert Origin.of(other).id != origin
+    assert sha256(file.read_bytes()).startswith(origin)
+    assert len(origin) == 12
+    certificate = _certified(calibration)
     document = _document(certificate)
-    assert document["id"] == names[0]
+    assert document["id"] == origin
     expected = sha256(encode_calibration(calibration))
     assert document["sha256"] == expected
-    texts = Reader(certificate_page(certificate)).texts
-    assert f"Calibration certificate {names[0]}" in texts
+    assert f"Calibration certificate {origin}" in _texts_of(certificate)
 
 
 def test_gains_that_are_not_written_may_be_written_and_what_would_be_is_shown(
@@ -478,14 +509,13 @@ def test_gains_that_are_not_written_may_be_written_and_what_would_be_is_shown(
     assert certificate.verdict is Verdict.READY
     document = _document(certificate)
     assert document["status"]["state"] == "not written"
-    write = document["status"]["write"]
-    acceptance = document["status"]["acceptance"]
-    assert write is acceptance is None
-    texts = Reader(certificate_page(certificate)).texts
+    assert document["status"]["write"] is None
+    assert document["status"]["acceptance"] is None
+    texts = _texts_of(certificate)
     assert "What would be written into controllers/demo.yaml" in texts
-    writtens = {axis["written"] for axis in document["axes"]}
-    assert writtens <= set(texts)
-    assert any(text.startswith("not written (as of ") for text in texts)
+    written = {axis["written"] for axis in document["axes"]}
+    assert written <= set(texts)
+    assert _texts_with("not written (as of ", texts) != []
 
 
 def test_gains_that_were_written_are_shown_as_written_beside_the_previous_ones(
@@ -515,15 +545,22 @@ def test_gains_that_were_written_are_shown_as_written_beside_the_previous_ones(
     assert "J4 most, by -20.1 %" in document["sentence"]
     # In JSON the gains are compared with the current gains.
     assert document["verdict"] == "unchanged"
-    assert [axis["old"] for axis in document["axes"]] == pytest.approx(IDENTIFIED, rel=1e-4)
-    texts = Reader(certificate_page(certificate)).texts
-    assert {f"{old:.5g}" for old in NAMEPLATE} <= set(texts)
+    old_gains = [axis["old"] for axis in document["axes"]]
+    assert old_gains == pytest.approx(IDENTIFIED, rel=1e-4)
+    texts = _texts_of(certificate)
+    nameplates = {f"{old:.5g}" for old in NAMEPLATE}
+    assert nameplates <= set(texts)
     assert "What was written into controllers/demo.yaml" in texts
-    assert not any("would be written" in text or "Ready" in text for text in texts)
+    for text in texts:
+        assert "would be written" not in text
+        assert "Ready" not in text
     assert texts.count("differs from the previous gain") == 6
-    assert [row.judged for row in certificate.shown] == [row.judged for row in ready.rows]
+    judged = [row.judged for row in certificate.shown]
+    assert judged == [row.judged for row in ready.rows]
     # The comments of this controller file say where the earlier gains came from.
-    assert any("J1: “Nm at the joint per A, from the data sheet”" in text for text in texts)
+    comment = "J1: “Nm at the joint per A, from the data sheet”"
+    with_comment = [text for text in texts if comment in text]
+    assert with_comment != []
 
 
 def test_a_write_that_was_rolled_back_is_not_in_force(cell_file: Path) -> None:
@@ -537,9 +574,8 @@ def test_a_write_that_was_rolled_back_is_not_in_force(cell_file: Path) -> None:
     assert ended["who"].startswith("B. Ode")
     assert "; rolled back on " in document["status"]["text"]
     assert not document["sentence"].startswith("Written")
-    assert ("What would be written into controllers/demo.yaml") in Reader(
-        certificate_page(certificate)
-    ).texts
+    texts = _texts_of(certificate)
+    assert "What would be written into controllers/demo.yaml" in texts
 
 
 def test_a_file_that_was_changed_by_hand_after_the_write_is_noticed(cell_file: Path) -> None:
@@ -578,7 +614,9 @@ def _recorded_in_order(payloads: str) -> tuple[Source, ...]:
     for place, kind in enumerate(payloads):
         recorded_s = 1.7e9 + 60.0 * place
         recording = replace(demo_recording(), recorded_s=recorded_s)
-        payload = "disc" if kind == "l" else None
+        payload = None
+        if kind == "l":
+            payload = "disc"
         source = Source(f"r{place}", f"{place:064x}", "fit", payload=payload, recording=recording)
         sources.append(source)
     return tuple(reversed(sources))
@@ -600,8 +638,8 @@ def test_the_order_of_runs_says_whether_a_warm_up_moves_the_gains(payloads: str,
 
 
 def test_with_friction_by_payload_no_order_of_runs_moves_the_gains() -> None:
-    by_payload = tuple(Parameter(f"fs{axis}_loaded", -0.4, 0.1, "Nm") for axis in range(1, 7))
     declared = demo_calibration()
+    by_payload = [Parameter(f"fs{axis}_loaded", -0.4, 0.1, "Nm") for axis in range(1, 7)]
     parameters = (*declared.parameters, *by_payload)
     calibration = replace(declared, sources=_recorded_in_order("bbll"), parameters=parameters)
     said = "bare, bare, loaded, loaded; friction by payload: its change between them moves no gain"
@@ -666,9 +704,8 @@ def test_a_calibration_that_new_moves_contradict_says_what_failed_and_how_to_und
     assert "; NOT ACCEPTED on 2025-01-02 03:00 UTC by A. Miller: J4 is 25 % off" in status["text"]
     assert "to undo the write: drivegain rollback demo.yaml" in status["text"]
     assert certificate.sentence.endswith(". New moves contradict them: J4 is 25 % off.")
-    assert ("To undo the write: <code>drivegain rollback demo.yaml</code>") in certificate_page(
-        certificate
-    )
+    page = certificate_page(certificate)
+    assert "To undo the write: <code>drivegain rollback demo.yaml</code>" in page
 
 
 def test_a_name_in_the_audit_log_commands_neither_a_terminal_nor_a_page(
@@ -685,7 +722,8 @@ def test_a_name_in_the_audit_log_commands_neither_a_terminal_nor_a_page(
     audit = cell_file.with_name("demo.audit.jsonl")
     record_session(audit, AuditAction.ACCEPTED, at=NOW, who=who, subject="x", details=details)
     capsys.readouterr()
-    assert main(["certificate", str(calibration_file), "--cell", str(cell_file)]) == ExitCode.OK
+    status = main(["certificate", str(calibration_file), "--cell", str(cell_file)])
+    assert status == ExitCode.OK
     said = capsys.readouterr().out
     assert "accepted on 2025-01-02 03:00 UTC by \\x1b[2J" in said
     assert "\x1b" not in said
@@ -700,7 +738,7 @@ def test_without_a_cell_the_status_is_not_known(
     file = tmp_path / "calibration.yaml"
     save_calibration(demo_calibration(), file)
     assert run_verb("certificate", file, "--json") == ExitCode.OK
-    document = json.loads(capsys.readouterr().out)
+    document = _printed_document(capsys)
     assert document["status"]["state"] == "not known"
     assert document["status"]["as_of"] is None
     assert "--cell CELL" in document["status"]["text"]
@@ -733,7 +771,7 @@ def test_a_calibration_in_a_session_names_it_and_another_one_in_its_folder_does_
     calibration = tmp_path / "calibration.yaml"
     assert session_of(calibration, digest) is None
     assert run_verb("certificate", file, "--json") == ExitCode.OK
-    document = json.loads(capsys.readouterr().out)
+    document = _printed_document(capsys)
     assert document["session"] == folder.name
     text = file.with_suffix(".html").read_text(encoding="utf-8")
     assert folder.name in Reader(text).texts
@@ -752,7 +790,8 @@ def test_a_name_of_another_format_is_refused(
     assert "saves it as a PDF" in said
     assert not out.exists()
     for other in ("page.HTML", "page"):
-        assert main(["certificate", str(file), "--out", str(tmp_path / other)]) == ExitCode.OK
+        out = tmp_path / other
+        assert main(["certificate", str(file), "--out", str(out)]) == ExitCode.OK
 
 
 def test_the_earlier_name_of_the_verb_writes_the_same_page(

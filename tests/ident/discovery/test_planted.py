@@ -83,6 +83,16 @@ class TrueSignals:
         return np.asarray(self.velocities[self.axis])
 
     @property
+    def speed(self) -> FloatArray:
+        """Absolute velocity of the axis."""
+        return np.abs(self.velocity)
+
+    @property
+    def direction(self) -> FloatArray:
+        """Sign of the velocity of the axis."""
+        return np.asarray(np.sign(self.velocity))
+
+    @property
     def load(self) -> FloatArray:
         """Load of the axis."""
         return np.asarray(self.loads[self.axis])
@@ -97,6 +107,11 @@ class TrueSignals:
         """Motor angle of the axis."""
         return np.asarray(self.motor_angles[self.axis])
 
+    @property
+    def session_s(self) -> FloatArray:
+        """Time since the session began."""
+        return self.started_s + self.time_s
+
     def inertia_column(self) -> FloatArray:
         """Torque of every joint per unit of acceleration of the axis, at every sample."""
         return self.inertia_columns(self.axis)
@@ -107,8 +122,18 @@ class TrueSignals:
         after = of_time[2:]
         here = of_time[1:-1]
         before = of_time[:-2]
-        middle = (after - 2.0 * here + before) / step**2
-        return np.concatenate((middle[:1], middle, middle[-1:]))
+        difference = after - 2.0 * here + before
+        middle = difference / step**2
+        first = middle[:1]
+        last = middle[-1:]
+        return np.concatenate((first, middle, last))
+
+    def on_two_joints(self, own: FloatArray, other: FloatArray) -> FloatArray:
+        """Torque of all joints, of which one acts on the axis and one on J3, shape (n, k)."""
+        torque = np.zeros_like(self.positions)
+        torque[self.axis] = own
+        torque[J3] = other
+        return torque
 
 
 @dataclass(frozen=True)
@@ -155,8 +180,10 @@ def _torque_lost_by_saturation(t: TrueSignals, half_a: float) -> FloatArray:
     """
     gain = GAINS[t.axis]
     least_a = t.motor_torque / gain
-    root = np.sqrt(1.0 - 4.0 * (least_a / half_a) ** 2)
-    saturated = gain * 2.0 * least_a / (1.0 + root)
+    share = least_a / half_a
+    root = np.sqrt(1.0 - 4.0 * share**2)
+    current_a = 2.0 * least_a / (1.0 + root)
+    saturated = gain * current_a
     return np.asarray(saturated - t.motor_torque)
 
 
@@ -172,11 +199,14 @@ def _first_order_lag(torque: FloatArray, constant_s: float, rate_hz: float) -> F
     out = np.empty_like(torque)
     state = float(torque[0])
     steps = 10
+    constant_steps = constant_s * rate_hz * steps
     before = state
     for sample, value in enumerate(torque.tolist()):
+        change = value - before
         for step in range(steps):
-            asked = before + (value - before) * (step + 0.5) / steps
-            state += (asked - state) / (constant_s * rate_hz * steps)
+            middle = (step + 0.5) / steps
+            target = before + change * middle
+            state += (target - state) / constant_steps
         out[sample] = state
         before = value
     return out
@@ -184,21 +214,20 @@ def _first_order_lag(torque: FloatArray, constant_s: float, rate_hz: float) -> F
 
 def _time_skew(t: TrueSignals) -> FloatArray:
     """Current of every axis recorded 8 ms late."""
-    time_s = np.arange(t.motor_torques.shape[1]) / t.rate_hz
-    asked_s = time_s - 0.008
-    late = [np.interp(asked_s, time_s, torque) for torque in t.motor_torques]
+    _, count = t.motor_torques.shape
+    time_s = np.arange(count) / t.rate_hz
+    earlier_s = time_s - 0.008
+    late = [np.interp(earlier_s, time_s, torque) for torque in t.motor_torques]
     return np.stack(late) - t.motor_torques
 
 
 def _stribeck(t: TrueSignals) -> FloatArray:
-    speed = np.abs(t.velocity)
-    growth = np.exp(speed / 0.2)
-    return np.asarray(6.0 * np.sign(t.velocity) / growth)
+    left = np.exp(-t.speed / 0.2)
+    return np.asarray(6.0 * t.direction * left)
 
 
 def _nonlinear_viscous(t: TrueSignals) -> FloatArray:
-    speed = np.abs(t.velocity)
-    return np.asarray(1.5 * t.velocity * speed)
+    return np.asarray(1.5 * t.velocity * t.speed)
 
 
 def _asymmetric_viscous(t: TrueSignals) -> FloatArray:
@@ -211,13 +240,13 @@ def _load_friction(t: TrueSignals) -> FloatArray:
 
 
 def _friction_by_load(t: TrueSignals, share: float) -> FloatArray:
-    absolute_load = np.abs(t.load)
-    return np.asarray(share * absolute_load * np.sign(t.velocity))
+    dry = share * np.abs(t.load)
+    return np.asarray(dry * t.direction)
 
 
 def _position_friction(t: TrueSignals) -> FloatArray:
-    by_position = np.cos(t.position + 0.7)
-    return np.asarray(np.sign(t.velocity) * 1.5 * by_position)
+    dry = 1.5 * np.cos(t.position + 0.7)
+    return np.asarray(dry * t.direction)
 
 
 def _warm_up_of_a_run(t: TrueSignals) -> FloatArray:
@@ -225,30 +254,32 @@ def _warm_up_of_a_run(t: TrueSignals) -> FloatArray:
 
 
 def _warm_up_of_a_session(t: TrueSignals) -> FloatArray:
-    session_s = t.started_s + t.time_s
-    return _cold_friction(t, session_s, constant_s=80.0)
+    return _cold_friction(t, t.session_s, constant_s=80.0)
 
 
 def _cold_friction(t: TrueSignals, clock_s: FloatArray, constant_s: float) -> FloatArray:
     """Friction that falls with time, as exp(-clock/constant)."""
     half_life_s = constant_s * np.log(2.0)
     left = np.exp2(-clock_s / half_life_s)
-    dry = 5.0 * np.sign(t.velocity)
+    dry = 5.0 * t.direction
     viscous = 2.0 * t.velocity
-    return np.asarray(left * (dry + viscous))
+    warm = dry + viscous
+    return np.asarray(left * warm)
 
 
 def _temperature_friction(t: TrueSignals) -> FloatArray:
     """Dry friction that grows with temperature, and viscous friction that falls."""
     above_k = t.temperatures[t.axis] - 40.0
-    dry = 0.15 * np.sign(t.velocity)
+    dry = 0.15 * t.direction
     viscous = 0.1 * t.velocity
-    return np.asarray(above_k * (dry - viscous))
+    per_k = dry - viscous
+    return np.asarray(above_k * per_k)
 
 
 def _presliding(t: TrueSignals) -> FloatArray:
     bristle = _bristle(t, 0.08)
-    return np.asarray(9.0 * (bristle - np.sign(t.velocity)))
+    missing = bristle - t.direction
+    return np.asarray(9.0 * missing)
 
 
 def _bristle(t: TrueSignals, distance_rad: float) -> FloatArray:
@@ -276,8 +307,9 @@ def _backlash(t: TrueSignals) -> FloatArray:
     width = 0.15 * rms_through
     growth = np.exp(2.0 * through / width)
     flank = 1.0 - 2.0 / (1.0 + growth)
-    flank_acceleration = t.second_derivative(flank)
-    return np.asarray(-half_gap_rad * t.inertia_column() * flank_acceleration)
+    gap_rad = half_gap_rad * flank
+    acceleration = t.second_derivative(gap_rad)
+    return np.asarray(-t.inertia_column() * acceleration)
 
 
 def _torque_through_the_gear(t: TrueSignals) -> FloatArray:
@@ -286,8 +318,9 @@ def _torque_through_the_gear(t: TrueSignals) -> FloatArray:
 
 def _elasticity(t: TrueSignals) -> FloatArray:
     """A gear of 2000 Nm/rad."""
-    load_acceleration = t.second_derivative(t.load)
-    return np.asarray(-0.0005 * t.inertia_column() * load_acceleration)
+    wind_up_rad = 0.0005 * t.load
+    acceleration = t.second_derivative(wind_up_rad)
+    return np.asarray(-t.inertia_column() * acceleration)
 
 
 def _efficiency(t: TrueSignals) -> FloatArray:
@@ -304,57 +337,52 @@ def _efficiency(t: TrueSignals) -> FloatArray:
 
 def _coupling(t: TrueSignals) -> FloatArray:
     """The same friction on this joint and on J3, from the sum of their velocities."""
-    torque = np.zeros_like(t.positions)
     velocity_sum = t.velocity + t.velocities[J3]
     dry = 2.0 * np.sign(velocity_sum)
     viscous = 0.8 * velocity_sum
-    torque[[t.axis, J3]] = dry + viscous
-    return torque
+    friction = dry + viscous
+    return t.on_two_joints(friction, friction)
 
 
 def _inertial_coupling(t: TrueSignals) -> FloatArray:
-    torque = np.zeros_like(t.positions)
-    torque[t.axis] = 0.25 * t.accelerations[J3]
-    torque[J3] = 0.25 * t.accelerations[t.axis]
-    return torque
+    own = 0.25 * t.accelerations[J3]
+    other = 0.25 * t.accelerations[t.axis]
+    return t.on_two_joints(own, other)
 
 
 def _hinge(t: TrueSignals) -> FloatArray:
     """A spring that begins at 0.5 rad."""
-    beyond_rad = t.position - 0.5
-    return np.where(t.position > 0.5, 12.0 * beyond_rad, 0.0)
+    beyond_rad = np.maximum(t.position - 0.5, 0.0)
+    return np.asarray(12.0 * beyond_rad)
 
 
 def _hose(t: TrueSignals) -> FloatArray:
     """A hose of 30 Nm/rad whose way is 0.8 q_i − 0.6 q_j, which pulls and pushes."""
-    way = 0.8 * t.position - 0.6 * t.positions[J3]
-    force = 30.0 * way
-    torque = np.zeros_like(t.positions)
-    torque[t.axis] = 0.8 * force
-    torque[J3] = -0.6 * force
-    return torque
+    own_way = 0.8 * t.position
+    other_way = 0.6 * t.positions[J3]
+    force = 30.0 * (own_way - other_way)
+    return t.on_two_joints(0.8 * force, -0.6 * force)
 
 
 def _slack_cable(t: TrueSignals) -> FloatArray:
     """A cable that pulls where the joint is before J3, around both at one radius;
     half of it on each.
     """
-    position_difference = t.position - t.positions[J3]
-    stretch = np.where(t.position > t.positions[J3], position_difference, 0.0)
-    torque = np.zeros_like(t.positions)
-    torque[t.axis] = 15.0 * stretch
-    torque[J3] = -15.0 * stretch
-    return torque
+    difference_rad = t.position - t.positions[J3]
+    stretch_rad = np.maximum(difference_rad, 0.0)
+    pull = 15.0 * stretch_rad
+    return t.on_two_joints(pull, -pull)
 
 
 def _offset_drift(t: TrueSignals) -> FloatArray:
-    session_s = t.started_s + t.time_s
-    return np.asarray(4.0 * np.exp(-session_s / 60.0))
+    left = np.exp(-t.session_s / 60.0)
+    return np.asarray(4.0 * left)
 
 
 def _gravity_compensator(t: TrueSignals) -> FloatArray:
     phase = np.arctan2(3.0, 4.0)
-    return np.asarray(5.0 * np.cos(2.0 * t.position - phase))
+    angle = 2.0 * t.position - phase
+    return np.asarray(5.0 * np.cos(angle))
 
 
 def _counterbalance(t: TrueSignals) -> FloatArray:
@@ -365,7 +393,8 @@ def _counterbalance(t: TrueSignals) -> FloatArray:
     angle = t.position - np.pi / 3.0
     shorter = _balancer_length_m(angle - 1e-6)
     longer = _balancer_length_m(angle + 1e-6)
-    return np.asarray(force_n * (longer - shorter) / 2e-6)
+    work_nm = force_n * (longer - shorter)
+    return np.asarray(work_nm / 2e-6)
 
 
 def _balancer_length_m(angle: FloatArray) -> FloatArray:
@@ -395,10 +424,12 @@ FRICTION_CASES = (
     Planted("temperature-friction", 1, _temperature_friction, (0.15, -0.1)),
     Planted("presliding", 1, _presliding, (9.0,)),
 )
+#: Dry friction that has the same loss, as a share of the load: (1 − η²)/(1 + η²)
+EFFICIENCY_SHARE = (1 - EFFICIENCY**2) / (1 + EFFICIENCY**2)
 GEAR_CASES = (
     Planted("backlash", 1, _backlash, (0.004,)),
     Planted("elasticity", 1, _elasticity, (0.0005,)),
-    Planted("efficiency", 1, _efficiency, ((1 - EFFICIENCY**2) / (1 + EFFICIENCY**2),)),
+    Planted("efficiency", 1, _efficiency, (EFFICIENCY_SHARE,)),
     Planted("coupling", 1, _coupling, (2.0, 0.8)),
     Planted("inertial-coupling", 0, _inertial_coupling, (0.25,)),
 )
@@ -412,12 +443,13 @@ OUTSIDE_CASES = (
 )
 SMALL_CASES = (*FRICTION_CASES, *GEAR_CASES, *OUTSIDE_CASES)
 """On the arm of three axes, which needs a third of the time."""
+ALL_CASES = (*CASES, *SMALL_CASES)
 
 
 def _case(family: str) -> Planted:
     """The first case of a family."""
-    cases = (*CASES, *SMALL_CASES)
-    return next(case for case in cases if case.family == family)
+    of_family = [case for case in ALL_CASES if case.family == family]
+    return of_family[0]
 
 
 @dataclass(frozen=True)
@@ -440,11 +472,12 @@ def warmth(run: Run, started_s: float) -> FloatArray:
     """Temperature of each of three drives [°C], shape (k, 3):
     slow waves between 30 and 50 °C, as loads change.
     """
-    session_s = started_s + run.time_s[:, None]
+    session_s = started_s + run.time_s
     time_constant_s = np.array([31.0, 23.0, 41.0])
     start_phase = np.array([0.3, 2.0, 4.1])
-    phase = session_s / time_constant_s + start_phase
-    return np.asarray(40.0 + 10.0 * np.sin(phase))
+    phase = session_s[:, None] / time_constant_s + start_phase
+    wave = np.sin(phase)
+    return np.asarray(40.0 + 10.0 * wave)
 
 
 @pytest.fixture(scope="module")
@@ -467,10 +500,12 @@ def _true(truth: Truth, data: Dataset) -> TrueSignals:
     names = [column.name for column in truth.model.columns]
     parameters = truth.parameters.copy()
     if data.payload is not None:
-        parameters[truth.model.flange] += list(PAYLOAD_TRUTH.values())
-    rigid = np.array([_is_rigid(name) for name in names])
-    rubbing = np.array([_is_joint_friction(name) for name in names])
-    rigid_parameters = parameters * rigid
+        payload = list(PAYLOAD_TRUTH.values())
+        parameters[truth.model.flange] += payload
+    rigid = [_is_rigid(name) for name in names]
+    rubbing = [_is_joint_friction(name) for name in names]
+    rigid_parameters = np.where(rigid, parameters, 0.0)
+    rubbing_parameters = np.where(rubbing, parameters, 0.0)
     motion = data.motion()
     columns = truth.model.regressor(motion)
 
@@ -479,9 +514,9 @@ def _true(truth: Truth, data: Dataset) -> TrueSignals:
         one = still.copy()
         one[:, axis] = 1.0
         accelerated = Motion(motion.position_rad, still, one)
-        held = Motion(motion.position_rad, still, still)
+        standing = Motion(motion.position_rad, still, still)
         moved = _torque(truth.model.regressor(accelerated), rigid_parameters)
-        at_rest = _torque(truth.model.regressor(held), rigid_parameters)
+        at_rest = _torque(truth.model.regressor(standing), rigid_parameters)
         return np.asarray(moved - at_rest)
 
     drive_train = truth.model.drive_train
@@ -489,7 +524,7 @@ def _true(truth: Truth, data: Dataset) -> TrueSignals:
     motor_torques = drive_train.to_motor @ joint_torques
     motor_angles = drive_train.ratio @ motion.position_rad.T
     loads = _torque(columns, rigid_parameters)
-    frictions = _torque(columns, parameters * rubbing)
+    frictions = _torque(columns, rubbing_parameters)
     time_s = data.time_s - data.time_s[0]
     temperatures = np.zeros((0, 0))
     if data.temperature_c is not None:
@@ -513,29 +548,33 @@ def _true(truth: Truth, data: Dataset) -> TrueSignals:
 
 def _is_rigid(name: str) -> bool:
     """Whether a column of the regressor is of a link, neither of a rotor nor of friction."""
-    return name[:2] not in ("Ia", "fv", "fs", "of")
+    return not name.startswith(("Ia", "fv", "fs", "of"))
 
 
 def _is_joint_friction(name: str) -> bool:
     """Whether a column of the regressor is of friction on a joint, not on a motor."""
-    return name[:2] in ("fv", "fs") and name[2] != "m"
+    is_friction = name.startswith(("fv", "fs"))
+    return is_friction and name[2] != "m"
 
 
 def _torque(columns: FloatArray, parameters: FloatArray) -> FloatArray:
     """Torque of every joint, shape (n, k), of a regressor of shape (n, c, k)."""
-    return np.asarray(np.einsum("jck,c->jk", columns, parameters))
+    torque = np.einsum("jck,c->jk", columns, parameters)
+    return np.asarray(torque)
 
 
 def _with(arm: Arm, planted: Planted) -> Evidence:
     def torque(data: Dataset) -> FloatArray:
-        changed_signal = replace(arm.signals[data.name], axis=planted.axis)
-        made = planted.torque(changed_signal)
+        signals = arm.signals[data.name]
+        of_axis = replace(signals, axis=planted.axis)
+        made = planted.torque(of_axis)
         if made.ndim == 2:
             on_all = made
         else:
-            on_all = acting_on(planted.axis, len(arm.truth.gains), made)
-        side = _family(planted.family)[0].side
-        if side in {GearSide.MOTOR, GearSide.ALL_MOTORS}:
+            axis_count = len(arm.truth.gains)
+            on_all = acting_on(planted.axis, axis_count, made)
+        simplest = _family(planted.family)[0]
+        if simplest.side in {GearSide.MOTOR, GearSide.ALL_MOTORS}:
             direction = arm.truth.model.drive_train.direction
             return np.asarray(direction.T @ on_all)
         return on_all
@@ -544,14 +583,15 @@ def _with(arm: Arm, planted: Planted) -> Evidence:
 
 
 def _family(name: str) -> tuple[Effect, ...]:
-    return next(family for family in EFFECTS if family[0].name == name)
+    of_name = [family for family in EFFECTS if family[0].name == name]
+    return of_name[0]
 
 
 def test_every_family_is_planted() -> None:
     """Those of joints without a motor in test_closed_chains.py."""
     simplest = [family[0] for family in EFFECTS]
     on_axes = {effect.name for effect in simplest if effect.with_motor}
-    planted = {case.family for case in (*CASES, *SMALL_CASES)}
+    planted = {case.family for case in ALL_CASES}
     assert planted == on_axes
 
 
@@ -578,15 +618,18 @@ def _is_named(arm: Arm, planted: Planted) -> None:
     assert best.passed
     place = (planted.family, planted.axis)
     indistinguishable = (best.placed, *best.ambiguity)
-    assert place in [(placed.effect.name, placed.axis) for placed in indistinguishable]
-    own = next(finding for finding in findings if (finding.effect.name, finding.axis) == place)
+    places = [(placed.effect.name, placed.axis) for placed in indistinguishable]
+    assert place in places
+    at_place = [finding for finding in findings if (finding.effect.name, finding.axis) == place]
+    own = at_place[0]
     after = with_effects(start, (own.placed,))
     first = len(after.rows_without_effects.columns)
     coefficients = after.estimate.parameters[first:]
-    found = coefficients[: len(planted.expected)]
+    count = len(planted.expected)
     expected = np.array(planted.expected)
     largest_expected = max(np.abs(expected))
-    assert found == pytest.approx(expected, rel=0.2, abs=0.1 * largest_expected)
+    near_expected = pytest.approx(expected, rel=0.2, abs=0.1 * largest_expected)
+    assert coefficients[:count] == near_expected
     error_before = training_error(start).axes[planted.axis]
     error_after = training_error(after).axes[planted.axis]
     assert error_after < error_before
@@ -625,10 +668,12 @@ def _gain_errors(arm: Arm, planted: Planted, first_order: Effect) -> GainErrors:
     assert last.accepted is None
     placed = PlacedEffect(first_order, planted.axis)
     with_first_order = with_effects(start, (placed,))
+    by_first_order = _gain_error(arm, with_first_order)
+    by_found = _gain_error(arm, first.after)
     return GainErrors(
         found=first.after.effects[0].effect,
-        by_first_order=_gain_error(arm, with_first_order)[planted.axis],
-        by_found=_gain_error(arm, first.after)[planted.axis],
+        by_first_order=by_first_order[planted.axis],
+        by_found=by_found[planted.axis],
     )
 
 
@@ -641,7 +686,8 @@ def _gain_error(arm: Arm, evidence: Evidence) -> FloatArray:
 def test_the_filter_of_a_lag_keeps_its_gain(arm: Arm) -> None:
     """What a first-order expansion lacks goes into the gain."""
     errors = _gain_errors(arm, _case("lag"), Lag())
-    assert errors.found.settings["filter_s"] == pytest.approx(0.01, rel=0.1)
+    filter_s = errors.found.settings["filter_s"]
+    assert filter_s == pytest.approx(0.01, rel=0.1)
     assert errors.by_found < 0.5 * errors.by_first_order
     assert errors.by_found < 0.01
 
@@ -658,7 +704,9 @@ def test_a_second_term_keeps_the_gain_of_a_saturated_motor(arm: Arm) -> None:
     evidence = _with(arm, planted)
     families = (_family("saturation"),)
     (family,) = search_problem_of(evidence).test(families, 2)
-    moves_of_first, moves_of_both = (moves_behind(trial.gram) for _, trial in family.members)
+    (_, first_trial), (_, trial_of_both) = family.members
+    moves_of_first = moves_behind(first_trial.gram)
+    moves_of_both = moves_behind(trial_of_both.gram)
     assert moves_of_both < FEWEST_MOVES < moves_of_first
     errors = _gain_errors(arm, planted, Saturation())
     assert errors.found == Saturation(two_terms=1)
@@ -671,8 +719,10 @@ def test_a_richer_form_needs_no_possible_simpler_one(small_arm: Arm) -> None:
     families = (_family("saturation"),)
     (family,) = problem.test(families, 1)
     (simple, simple_trial), (rich, rich_trial) = family.members
-    impossible = replace(simple_trial, coefficients=np.array([-1e9]))
-    possible = replace(rich_trial, coefficients=np.array([1.0, 1.0]))
+    negative = np.array([-1e9])
+    positive = np.array([1.0, 1.0])
+    impossible = replace(simple_trial, coefficients=negative)
+    possible = replace(rich_trial, coefficients=positive)
     members = ((simple, impossible), (rich, possible))
     tested = (replace(family, members=members),)
     rng = np.random.default_rng(0)
@@ -687,24 +737,23 @@ def test_motors_in_another_order_change_no_verdict(arm: Arm) -> None:
     drive_train = DriveTrain(RATIO[order])
     robot = arm.truth.model.robot
     model = Model(robot, drive_train)
-    training = replace(
-        start.training,
-        model=model,
-        current=start.training.current[order],
-        motor_use=start.training.motor_use[order],
-    )
+    current = start.training.current[order]
+    motor_use = start.training.motor_use[order]
+    training = replace(start.training, model=model, current=current, motor_use=motor_use)
     estimate = ml(training.system())
     turned = replace(start, model=model, training=training, estimate=estimate)
     families = (_family("spring"), _family("stribeck"), _family("load-friction"))
     rng = np.random.default_rng(0)
-    best = rank_effects(search_problem_of(turned), rng, GATES, families)[0]
+    search_problem = search_problem_of(turned)
+    best = rank_effects(search_problem, rng, GATES, families)[0]
     assert best.effect.name == "spring"
     assert best.axis == 1
     assert best.passed
     search_problem = search_problem_of(start, arm.cache)
     rng = np.random.default_rng(0)
     best_in_order = rank_effects(search_problem, rng, GATES, families)[0]
-    assert best.explained == pytest.approx(best_in_order.explained, rel=1e-3)
+    explained_in_order = pytest.approx(best_in_order.explained, rel=1e-3)
+    assert best.explained == explained_in_order
 
 
 def test_a_dead_current_channel_is_named(truth: Truth, noisy_runs: tuple[Run, ...]) -> None:
@@ -712,7 +761,8 @@ def test_a_dead_current_channel_is_named(truth: Truth, noisy_runs: tuple[Run, ..
     dead = []
     for run in noisy_runs:
         current_a = run.current_a * channels
-        dead.append(replace(run, current_a=current_a))
+        dead_run = replace(run, current_a=current_a)
+        dead.append(dead_run)
     with pytest.raises(CurrentConstant, match="axis J4: found a current that is zero throughout"):
         identify(truth.model, tuple(dead), CONDITIONING)
 
@@ -722,15 +772,15 @@ def test_too_few_moves_are_refused_and_continuous_motion_counts_by_time(
 ) -> None:
     standstill_rad_s = (0.0,) * 6
     never_still = replace(CONDITIONING, standstill_rad_s=standstill_rad_s)
-    whole = identify(truth.model, noisy_runs, never_still)
-    assert len(whole.system.clusters) >= 4 * 11
+    identified = identify(truth.model, noisy_runs, never_still)
+    assert len(identified.system.clusters) >= 4 * 11
     smallest_std = 1e-4 * np.abs(GAINS)
-    assert np.all(whole.estimate.gains_std > smallest_std)
+    assert np.all(identified.estimate.gains_std > smallest_std)
     rate_hz = clean_runs[0].rate_hz
     few = round(5.0 * rate_hz)
-    short = tuple(_first_samples(run, few) for run in clean_runs)
+    short = [_first_samples(run, few) for run in clean_runs]
     with pytest.raises(TooFewMoves, match="record longer"):
-        identify(truth.model, short, never_still)
+        identify(truth.model, tuple(short), never_still)
 
 
 def _first_samples(run: Run, count: int) -> Run:
@@ -756,15 +806,16 @@ def test_sigma_is_true_for_correlated_noise(small_arm: Arm) -> None:
     new_share = np.sqrt(1 - 0.67**2)
     gains = []
     claimed = []
+    axis_count, row_count = exact_a.shape
     for _ in range(24):
         noise = np.empty_like(exact_a)
-        noise[:, 0] = rng.normal(size=len(exact_a))
-        drawn = rng.normal(size=exact_a.shape)
-        for row in range(1, exact_a.shape[1]):
-            before = noise[:, row - 1]
-            noise[:, row] = 0.67 * before + new_share * drawn[:, row]
-        added_a = exact_a + 0.05 * noise - bare.current
-        found = with_current(clean, added_a).estimate
+        noise[:, 0] = rng.normal(size=axis_count)
+        drawn = new_share * rng.normal(size=exact_a.shape)
+        for row in range(1, row_count):
+            correlated = 0.67 * noise[:, row - 1]
+            noise[:, row] = correlated + drawn[:, row]
+        noisy_a = exact_a + 0.05 * noise
+        found = with_current(clean, noisy_a - bare.current).estimate
         gains.append(found.gains)
         claimed.append(found.gains_std)
     gain_std = np.std(gains, axis=0, ddof=1)

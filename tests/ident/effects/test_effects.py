@@ -41,7 +41,10 @@ SAMPLES = 400
 def random_signals(seed: int) -> Signals:
     """Signals of thirteen joints without mechanics between them."""
     rng = np.random.default_rng(seed)
-    position, velocity, acceleration, load, motor, geared = rng.normal(size=(6, JOINTS, SAMPLES))
+    normal = rng.normal(size=(6, JOINTS, SAMPLES))
+    position, velocity, acceleration, load, motor, geared = normal
+    inertia = rng.normal(size=(JOINTS, JOINTS, SAMPLES))
+    warming = rng.normal(size=(JOINTS, SAMPLES))
     motor_torque_nm = np.cumsum(motor, axis=1)
     time_s = np.arange(SAMPLES) / 100.0
     return Signals(
@@ -52,32 +55,53 @@ def random_signals(seed: int) -> Signals:
         velocity_rad_s=velocity,
         acceleration_rad_s2=acceleration,
         motor_position_rad=30.0 * position,
-        inertia_kg_m2=rng.normal(size=(JOINTS, JOINTS, SAMPLES)),
+        inertia_kg_m2=inertia,
         load_torque_nm=load,
         geared_torque_nm=geared,
         motor_torque_nm=motor_torque_nm,
         current_a=motor_torque_nm / 20.0,
-        temperature_c=45.0 + 5.0 * rng.normal(size=(JOINTS, SAMPLES)),
+        temperature_c=45.0 + 5.0 * warming,
     )
+
+
+#: Signals that a smooth effect can depend on
+SMOOTH_SIGNALS = (
+    "time_s",
+    "session_s",
+    "position_rad",
+    "velocity_rad_s",
+    "motor_position_rad",
+    "load_torque_nm",
+    "motor_torque_nm",
+    "current_a",
+)
+#: Signals of which each axis has its own
+SIGNALS_OF_AXES = (
+    "position_rad",
+    "velocity_rad_s",
+    "acceleration_rad_s2",
+    "motor_position_rad",
+    "load_torque_nm",
+    "geared_torque_nm",
+    "motor_torque_nm",
+    "current_a",
+)
 
 
 def _scaled(s: Signals, factor: float) -> Signals:
-    return replace(
-        s,
-        time_s=factor * s.time_s,
-        session_s=factor * s.session_s,
-        position_rad=factor * s.position_rad,
-        velocity_rad_s=factor * s.velocity_rad_s,
-        motor_position_rad=factor * s.motor_position_rad,
-        load_torque_nm=factor * s.load_torque_nm,
-        motor_torque_nm=factor * s.motor_torque_nm,
-        current_a=factor * s.current_a,
-    )
+    scaled = {}
+    for name in SMOOTH_SIGNALS:
+        signal = getattr(s, name)
+        scaled[name] = factor * signal
+    return replace(s, **scaled)
 
 
 def _over_its_range(variable: Abscissa, signed: int, other_axis: int = 0) -> Smooth:
-    other = other_axis - 1 if other_axis else None
-    x = np.abs(random_signals(5).variable(variable, 0, other))
+    other = None
+    if other_axis:
+        other = other_axis - 1
+    signals = random_signals(5)
+    x = np.abs(signals.variable(variable, 0, other))
     lower = float(np.quantile(x, 0.05))
     upper = float(np.quantile(x, 0.95))
     return Smooth(variable, lower, upper, signed, other_axis)
@@ -85,18 +109,22 @@ def _over_its_range(variable: Abscissa, signed: int, other_axis: int = 0) -> Smo
 
 def _generic_families() -> Iterator[tuple[Effect, ...]]:
     for variable, signs in VARIABLES:
-        yield tuple(_over_its_range(variable, signed) for signed in signs)
+        family = [_over_its_range(variable, signed) for signed in signs]
+        yield tuple(family)
     other = Abscissa.OTHER_VELOCITY
-    yield tuple(_over_its_range(other, signed, other_axis=4) for signed in (0, 1))
+    unsigned = _over_its_range(other, 0, other_axis=4)
+    signed = _over_its_range(other, 1, other_axis=4)
+    yield (unsigned, signed)
     yield (Periodic(0), Periodic(1))
 
 
 GENERIC = tuple(_generic_families())
-ALL_EFFECTS = (*chain.from_iterable(EFFECTS), *chain.from_iterable(GENERIC))
+FAMILIES = (*EFFECTS, *GENERIC)
+ALL_EFFECTS = tuple(chain.from_iterable(FAMILIES))
 
 
 def _members() -> Iterator[Any]:
-    for family in (*EFFECTS, *GENERIC):
+    for family in FAMILIES:
         for index, effect in enumerate(family):
             yield pytest.param(effect, id=f"{effect.name}-{index}")
 
@@ -105,31 +133,38 @@ MEMBERS = list(_members())
 
 
 def _largest(values: FloatArray) -> float:
-    return float(np.max(np.abs(values)))
+    absolute = np.abs(values)
+    return float(np.max(absolute))
 
 
 def _same(one: FloatArray, other: FloatArray) -> bool:
     # A motor angle of a hundred radians and the square of a rate each cost some digits.
-    return np.allclose(one, other, rtol=1e-8, atol=1e-10 * _largest(other) + 1e-12)
+    tolerance = 1e-10 * _largest(other) + 1e-12
+    return np.allclose(one, other, rtol=1e-8, atol=tolerance)
 
 
 def _is_odd(before: FloatArray, reversed_: FloatArray) -> bool:
-    return bool(np.any(before)) and _same(reversed_, -before)
+    is_seen = bool(np.any(before))
+    return is_seen and _same(reversed_, -before)
 
 
-def _is_zero_where_held(free: FloatArray, held: FloatArray) -> bool:
-    """Whether columns are zero where a signal was held over the middle half.
+def _is_zero_where_constant(free: FloatArray, stopped: FloatArray) -> bool:
+    """Whether columns are zero where a signal was constant over the middle half.
 
     A filter, forwards or backwards in time, has forgotten the rest in its middle.
     """
-    middle = held[..., SAMPLES // 2 - 5 : SAMPLES // 2 + 5]
-    return bool(np.any(free)) and _largest(middle) <= 1e-7 * _largest(free)
+    centre = SAMPLES // 2
+    middle = stopped[..., centre - 5 : centre + 5]
+    is_seen = bool(np.any(free))
+    return is_seen and _largest(middle) <= 1e-7 * _largest(free)
 
 
-def _held(value: FloatArray) -> FloatArray:
-    held = value.copy()
-    held[:, SAMPLES // 4 : -SAMPLES // 4] = 1.5
-    return held
+def _stopped(value: FloatArray) -> FloatArray:
+    """A signal that is constant over the middle half."""
+    stopped = value.copy()
+    quarter = SAMPLES // 4
+    stopped[:, quarter:-quarter] = 1.5
+    return stopped
 
 
 def _claim_holds(effect: Effect, claim: Property, axis: int, seed: int) -> bool:
@@ -143,19 +178,26 @@ def _claim_holds(effect: Effect, claim: Property, axis: int, seed: int) -> bool:
 
     def changed(**signals: Any) -> FloatArray:
         """Columns with other signals."""
-        return effect.columns(replace(s, **signals), axis)
+        other = replace(s, **signals)
+        return effect.columns(other, axis)
 
     match claim:
         case Property.ODD_IN_VELOCITY:
-            holds = _is_odd(columns, changed(velocity_rad_s=-velocity))
+            reversed_ = changed(velocity_rad_s=-velocity)
+            holds = _is_odd(columns, reversed_)
         case Property.EVEN_IN_VELOCITY:
-            has_a_say = not _same(changed(velocity_rad_s=2.0 * velocity), columns)
-            holds = has_a_say and _same(changed(velocity_rad_s=-velocity), columns)
+            doubled = changed(velocity_rad_s=2.0 * velocity)
+            reversed_ = changed(velocity_rad_s=-velocity)
+            is_seen = not _same(doubled, columns)
+            holds = is_seen and _same(reversed_, columns)
         case Property.INDEPENDENT_OF_VELOCITY:
-            holds = _same(changed(velocity_rad_s=3.0 + velocity**2), columns)
+            at_another = changed(velocity_rad_s=3.0 + velocity**2)
+            holds = _same(at_another, columns)
         case Property.PERIODIC_IN_MOTOR_ANGLE:
-            has_a_say = not _same(changed(motor_position_rad=angle + 0.3), columns)
-            holds = has_a_say and _same(changed(motor_position_rad=angle + 2.0 * np.pi), columns)
+            turned = changed(motor_position_rad=angle + 0.3)
+            turned_once = changed(motor_position_rad=angle + 2.0 * np.pi)
+            is_seen = not _same(turned, columns)
+            holds = is_seen and _same(turned_once, columns)
         case Property.ODD_IN_CURRENT:
             reversed_ = changed(motor_torque_nm=-s.motor_torque_nm, current_a=-s.current_a)
             holds = _is_odd(columns, reversed_)
@@ -165,16 +207,21 @@ def _claim_holds(effect: Effect, claim: Property, axis: int, seed: int) -> bool:
             )
             holds = _is_odd(columns, reversed_)
         case Property.RATE_OF_TORQUE:
-            held = changed(motor_torque_nm=_held(s.motor_torque_nm))
-            holds = _is_zero_where_held(columns, held)
+            stopped_nm = _stopped(s.motor_torque_nm)
+            stopped = changed(motor_torque_nm=stopped_nm)
+            holds = _is_zero_where_constant(columns, stopped)
         case Property.RATE_OF_LOAD:
-            held = changed(load_torque_nm=_held(s.load_torque_nm))
-            holds = _is_zero_where_held(columns, held)
+            stopped_nm = _stopped(s.load_torque_nm)
+            stopped = changed(load_torque_nm=stopped_nm)
+            holds = _is_zero_where_constant(columns, stopped)
         case Property.SMOOTH:
             # A uniform cubic spline's slope is less than one an interval, and no variable here is
             # more than a hundred times its range; a change by a small part of itself turns no sign.
-            change = effect.columns(_scaled(s, 1.0 + 1e-8), axis) - columns
-            holds = bool(np.any(change)) and _largest(change) <= 1e-8 * 100.0 * INTERVALS
+            scaled = _scaled(s, 1.0 + 1e-8)
+            change = effect.columns(scaled, axis) - columns
+            is_seen = bool(np.any(change))
+            largest_change = 1e-8 * 100.0 * INTERVALS
+            holds = is_seen and _largest(change) <= largest_change
     return holds
 
 
@@ -216,7 +263,8 @@ def test_every_property_can_be_refuted_and_is_claimed_by_someone() -> None:
     assert claims == of_signals
     declares = {effect.declares for effect in ALL_EFFECTS}
     assert declares == of_signals
-    of_geometry = {effect.declares for effect in chain.from_iterable(GEOMETRY)}
+    geometry = chain.from_iterable(GEOMETRY)
+    of_geometry = {effect.declares for effect in geometry}
     assert of_geometry == {Property.TURNS_THE_ARM}
 
 
@@ -224,7 +272,9 @@ def test_every_property_can_be_refuted_and_is_claimed_by_someone() -> None:
 def test_columns_are_as_many_as_coefficients_and_belong_to_their_axes(effect: Effect) -> None:
     signals = random_signals(5)
     columns = effect.columns(signals, 0)
-    assert columns.shape == (*_joints_of_columns(effect), len(effect.coefficients), SAMPLES)
+    joints = _joints_of_columns(effect)
+    count = len(effect.coefficients)
+    assert columns.shape == (*joints, count, SAMPLES)
     assert np.all(np.isfinite(columns))
 
     is_moving = np.ptp(columns, axis=-1) > 0
@@ -232,19 +282,25 @@ def test_columns_are_as_many_as_coefficients_and_belong_to_their_axes(effect: Ef
         is_moving = is_moving.any(axis=0)
     is_spring = effect.name == "passive-spring"
     is_constant = [is_spring and column.name == "preload" for column in effect.coefficients]
-    assert np.all(is_moving | np.array(is_constant))
+    is_as_declared = is_moving | np.array(is_constant)
+    assert np.all(is_as_declared)
 
     own = _own_axes(effect)
     others = [axis for axis in range(JOINTS) if axis not in own]
-    assert np.array_equal(effect.columns(_with_other_signals(signals, others), 0), columns)
+    others_changed = _with_other_signals(signals, others)
+    assert np.array_equal(effect.columns(others_changed, 0), columns)
     # What depends on the clock alone is the same on all axes.
+    own_changed = _with_other_signals(signals, own)
+    is_signed = bool(effect.settings.get("signed"))
+    if is_signed or not _is_of_the_clock(effect):
+        assert not np.allclose(effect.columns(own_changed, 0), columns)
+
+
+def _is_of_the_clock(effect: Effect) -> bool:
+    """Whether an effect depends on the time alone, where it has no sign of the velocity."""
     is_by_time = effect.abscissa in {Abscissa.TIME, Abscissa.SESSION}
-    of_the_clock = is_by_time and effect.declares in {
-        Property.SMOOTH,
-        Property.INDEPENDENT_OF_VELOCITY,
-    }
-    if not of_the_clock or effect.settings.get("signed"):
-        assert not np.allclose(effect.columns(_with_other_signals(signals, own), 0), columns)
+    without_motion = {Property.SMOOTH, Property.INDEPENDENT_OF_VELOCITY}
+    return is_by_time and effect.declares in without_motion
 
 
 def _joints_of_columns(effect: Effect) -> tuple[int, ...]:
@@ -269,23 +325,18 @@ def _own_axes(effect: Effect) -> list[int]:
 def _with_other_signals(signals: Signals, axes: list[int]) -> Signals:
     """The signals, with those of these axes taken from another recording."""
     others = random_signals(6)
+    mixed = {}
+    for name in SIGNALS_OF_AXES:
+        other = getattr(others, name)
+        signal = getattr(signals, name).copy()
+        signal[axes] = other[axes]
+        mixed[name] = signal
+    return replace(signals, **mixed)
 
-    def mixed(array: FloatArray, other: FloatArray) -> FloatArray:
-        array = array.copy()
-        array[axes] = other[axes]
-        return array
 
-    return replace(
-        signals,
-        position_rad=mixed(signals.position_rad, others.position_rad),
-        velocity_rad_s=mixed(signals.velocity_rad_s, others.velocity_rad_s),
-        acceleration_rad_s2=mixed(signals.acceleration_rad_s2, others.acceleration_rad_s2),
-        motor_position_rad=mixed(signals.motor_position_rad, others.motor_position_rad),
-        load_torque_nm=mixed(signals.load_torque_nm, others.load_torque_nm),
-        geared_torque_nm=mixed(signals.geared_torque_nm, others.geared_torque_nm),
-        motor_torque_nm=mixed(signals.motor_torque_nm, others.motor_torque_nm),
-        current_a=mixed(signals.current_a, others.current_a),
-    )
+def _stacked(*joints: FloatArray) -> Any:
+    """Columns of each joint one over the other, about equal to others."""
+    return pytest.approx(np.stack(joints))
 
 
 def test_columns_act_where_the_effect_says() -> None:
@@ -300,30 +351,35 @@ def test_columns_act_where_the_effect_says() -> None:
 
     # Motor 3 turns with joints 2 and 3, the second at half the ratio.
     at_motor_3 = at_joints(Cogging(1), 2, of_axis, train)
-    assert at_motor_3 == pytest.approx(np.stack((none, 0.5 * of_axis, of_axis)))
+    assert at_motor_3 == _stacked(none, 0.5 * of_axis, of_axis)
     at_joint_2 = at_joints(Spring(), 1, of_axis, train)
-    assert at_joint_2 == pytest.approx(np.stack((none, of_axis, none)))
+    assert at_joint_2 == _stacked(none, of_axis, none)
     at_joints_1_and_3 = at_joints(Coupling(3, 1), 0, of_pair, train)
-    assert at_joints_1_and_3 == pytest.approx(np.stack((of_pair[0], none, of_pair[1])))
+    assert at_joints_1_and_3 == _stacked(of_pair[0], none, of_pair[1])
     at_all_joints = at_joints(Elasticity(), 1, of_all, train)
     assert np.array_equal(at_all_joints, of_all)
     at_all_motors = at_joints(TimeSkew(), 0, of_all, train)
-    expected = np.stack((of_all[0], of_all[1] + 0.5 * of_all[2], of_all[2]))
-    assert at_all_motors == pytest.approx(expected)
+    of_motor_1, of_motor_2, of_motor_3 = of_all
+    of_motors_2_and_3 = of_motor_2 + 0.5 * of_motor_3
+    assert at_all_motors == _stacked(of_motor_1, of_motors_2_and_3, of_motor_3)
 
 
 def test_a_pair_is_named_by_its_lower_axis_and_only_angles_have_a_sine() -> None:
     three = robot_from_urdf(THREE_AXES.urdf)
     gantry = robot_from_urdf(GANTRY.urdf)
-    coupled = [axis for axis in range(3) if is_placeable(Coupling(3, 1), axis, three)]
+    pair = Coupling(3, 1)
+    coupled = [axis for axis in range(3) if is_placeable(pair, axis, three)]
     assert coupled == [0, 1]
-    assert not is_placeable(Coupling(4, 1), 0, three)
+    beyond = Coupling(4, 1)
+    assert not is_placeable(beyond, 0, three)
     assert is_placeable(Spring(), 2, three)
     # What all motors share is tried once.
-    skewed = [axis for axis in range(3) if is_placeable(TimeSkew(), axis, three)]
+    skew = TimeSkew()
+    skewed = [axis for axis in range(3) if is_placeable(skew, axis, three)]
     assert skewed == [0]
-    assert is_placeable(PositionFriction(), 0, three)
-    assert not is_placeable(PositionFriction(), 0, gantry)
+    sine = PositionFriction()
+    assert is_placeable(sine, 0, three)
+    assert not is_placeable(sine, 0, gantry)
     assert is_placeable(Spring(), 0, gantry)
 
 
@@ -343,7 +399,8 @@ class Cubic(AsymmetricViscous):
 
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Columns, shape (1, k)."""
-        return np.asarray(signals.velocity_rad_s[axis] ** 3)[None]
+        cube = signals.velocity_rad_s[axis] ** 3
+        return np.asarray(cube)[None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -356,23 +413,30 @@ class Span:
     @property
     def label(self) -> str:
         """Name and settings."""
-        settings = ", ".join(f"{value:g}" for value in self.effect.settings.values())
+        values = self.effect.settings.values()
+        settings = ", ".join(f"{value:g}" for value in values)
         return f"{self.effect.name} ({settings})"
 
     def is_duplicate_of(self, other: Span) -> bool:
         """Whether the columns of one are in what the columns of the other span."""
         if self.effect.with_motor != other.effect.with_motor:  # never on the same joint
             return False
-        cosines = np.linalg.svd(self.directions @ other.directions.T, compute_uv=False)
+        products = self.directions @ other.directions.T
+        cosines = np.linalg.svd(products, compute_uv=False)
         return bool(cosines[-1] > 1.0 - 1e-9)
 
 
 def _span(effect: Effect, runs: tuple[Signals, ...], train: DriveTrain) -> Span:
-    torque_of_runs = [at_joints(effect, 0, effect.columns(run, 0), train) for run in runs]
+    torque_of_runs = []
+    for run in runs:
+        columns = effect.columns(run, 0)
+        torque_of_run = at_joints(effect, 0, columns, train)
+        torque_of_runs.append(torque_of_run)
     torque = np.concatenate(torque_of_runs, axis=-1)
     # joint, parameter, sample → parameter, joint and sample
-    columns = np.moveaxis(torque, 1, 0).reshape(torque.shape[1], -1)
-    _, _, directions = np.linalg.svd(columns, full_matrices=False)
+    of_parameters = np.moveaxis(torque, 1, 0)
+    flat = of_parameters.reshape(len(of_parameters), -1)
+    _, _, directions = np.linalg.svd(flat, full_matrices=False)
     return Span(effect, directions)
 
 
@@ -380,17 +444,19 @@ def _duplicates(families: tuple[tuple[Effect, ...], ...]) -> list[tuple[str, str
     """Pairs of effects of which one's columns span the other's on the robot's joints:
     they cannot be distinguished.
     """
-    train = DriveTrain(np.diag(np.linspace(30.0, 50.0, JOINTS)))
+    ratios = np.linspace(30.0, 50.0, JOINTS)
+    train = DriveTrain(np.diag(ratios))
     first_run = random_signals(5)
     later_run = random_signals(6)
     later_run = replace(later_run, session_s=300.0 + later_run.time_s)
     runs = (first_run, later_run)
-    spans = [_span(effect, runs, train) for effect in chain.from_iterable(families)]
-    return [
-        (one.label, other.label)
-        for one, other in combinations(spans, 2)
-        if one.is_duplicate_of(other)
-    ]
+    effects = chain.from_iterable(families)
+    spans = [_span(effect, runs, train) for effect in effects]
+    duplicates = []
+    for one, other in combinations(spans, 2):
+        if one.is_duplicate_of(other):
+            duplicates.append((one.label, other.label))
+    return duplicates
 
 
 @pytest.mark.slow
@@ -412,14 +478,13 @@ def test_the_rate_behind_a_filter_is_that_of_its_equation(backwards: int) -> Non
     time_s = (np.arange(300) - start) / rate_hz  # since t₀
     constant = np.full(300, 7.0)
     ramp = np.maximum(time_s, 0.0)
-    rate = np.where(time_s > 0.0, -np.expm1(-time_s / filter_s), 0.0)
+    rate = -np.expm1(-ramp / filter_s)
     if backwards:
         ramp = ramp[::-1]
         rate = -rate[::-1]
     effect = Lag(filter_s, backwards)
-    signals = replace(
-        random_signals(1), rate_hz=rate_hz, motor_torque_nm=np.stack((ramp, constant))
-    )
+    torque_nm = np.stack((ramp, constant))
+    signals = replace(random_signals(1), rate_hz=rate_hz, motor_torque_nm=torque_nm)
     of_ramp = effect.columns(signals, 0)
     assert of_ramp[0] == pytest.approx(-rate, abs=1e-9)
     of_constant = effect.columns(signals, 1)
@@ -428,9 +493,12 @@ def test_the_rate_behind_a_filter_is_that_of_its_equation(backwards: int) -> Non
 
 def test_with_no_filter_it_is_the_central_difference() -> None:
     signals = random_signals(1)
-    slope = np.gradient(signals.motor_torque_nm[2]) * signals.rate_hz
-    assert Lag().columns(signals, 2)[0] == pytest.approx(-slope)
-    assert TimeSkew().columns(signals, 0)[2, 0] == pytest.approx(-slope)
+    torque_nm = signals.motor_torque_nm[2]
+    slope = signals.rate_hz * np.gradient(torque_nm)
+    of_lag = Lag().columns(signals, 2)
+    of_skew = TimeSkew().columns(signals, 0)
+    assert of_lag[0] == pytest.approx(-slope)
+    assert of_skew[2, 0] == pytest.approx(-slope)
 
 
 @pytest.mark.parametrize(
@@ -449,7 +517,9 @@ def test_the_rest_of_a_rotor_is_the_derivative_of_a_loss(effect: LoadFriction | 
         return np.asarray(column)
 
     loss, rest = effect.columns(s, axis)
-    derivative = (without_rotor(0.4 + step, s) - without_rotor(0.4 - step, s)) / (2.0 * step)
+    more = without_rotor(0.4 + step, s)
+    less = without_rotor(0.4 - step, s)
+    derivative = (more - less) / (2.0 * step)
     assert_allclose(rest, derivative, atol=1e-6)
     rotor_torque_nm = 0.4 * s.acceleration_rad_s2
     without_rotor_torque = replace(
@@ -457,20 +527,25 @@ def test_the_rest_of_a_rotor_is_the_derivative_of_a_loss(effect: LoadFriction | 
         load_torque_nm=s.load_torque_nm - rotor_torque_nm,
         geared_torque_nm=s.geared_torque_nm - rotor_torque_nm,
     )
-    assert_allclose(loss, without_rotor(0.0, without_rotor_torque), atol=1e-12)
+    loss_of_link = without_rotor(0.0, without_rotor_torque)
+    assert_allclose(loss, loss_of_link, atol=1e-12)
 
 
 def test_effects_behind_the_gear_leave_a_known_rotor_out() -> None:
     s = random_signals(4)
     axis = 2
     rotor_kg_m2 = 0.3
-    loss = PlacedEffect(LoadFriction(0, rotor_kg_m2, 1), axis)
-    known = beside_rotors(s, (PlacedEffect(Elasticity(), 1), loss))
+    friction = LoadFriction(0, rotor_kg_m2, 1)
+    loss = PlacedEffect(friction, axis)
+    elasticity = Elasticity()
+    on_another_axis = PlacedEffect(elasticity, 1)
+    known = beside_rotors(s, (on_another_axis, loss))
 
     turning_nm = rotor_kg_m2 * s.acceleration_rad_s2[axis]
     link_torque_nm = s.load_torque_nm[axis] - turning_nm
+    gear_torque_nm = s.geared_torque_nm[axis] - turning_nm
     assert_allclose(known.link_torque(axis), link_torque_nm)
-    assert_allclose(known.gear_torque(axis), s.geared_torque_nm[axis] - turning_nm)
+    assert_allclose(known.gear_torque(axis), gear_torque_nm)
     assert_allclose(known.variable(Abscissa.LOAD, axis), link_torque_nm)
     assert_allclose(known.link_torque(1), s.load_torque_nm[1])
 
@@ -478,11 +553,14 @@ def test_effects_behind_the_gear_leave_a_known_rotor_out() -> None:
     column = s.inertia(every, axis).copy()
     column[axis] -= rotor_kg_m2
     assert_allclose(known.inertia(every, axis), column)
-    assert_allclose(known.inertia(axis, axis), s.inertia(axis, axis) - rotor_kg_m2)
+    own_inertia = s.inertia(axis, axis) - rotor_kg_m2
+    assert_allclose(known.inertia(axis, axis), own_inertia)
     assert_array_equal(known.inertia(every, 1), s.inertia(every, 1))
 
-    assert_array_equal(loss.effect.columns(known, axis), loss.effect.columns(s, axis))
-    assert not np.allclose(Elasticity().columns(known, axis), Elasticity().columns(s, axis))
+    friction_with_known = friction.columns(known, axis)
+    assert_array_equal(friction_with_known, friction.columns(s, axis))
+    elasticity_with_known = elasticity.columns(known, axis)
+    assert not np.allclose(elasticity_with_known, elasticity.columns(s, axis))
     without_rotor = PlacedEffect(LoadFriction(0), axis)
     assert beside_rotors(s, (without_rotor,)) is s
 

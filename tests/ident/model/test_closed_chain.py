@@ -40,47 +40,104 @@ STEP_S = 1e-3
 TOLERANCE = 1e-9
 
 
+def _largest(values: FloatArray) -> float:
+    """Largest absolute value."""
+    return float(np.max(np.abs(values)))
+
+
 def _turn(rng: np.random.Generator) -> FloatArray:
+    """A random rotation."""
     q, _ = np.linalg.qr(rng.normal(size=(3, 3)))
-    determinant_sign = np.sign(np.linalg.det(q))
-    return np.asarray(q * determinant_sign)
+    determinant = np.linalg.det(q)
+    return np.asarray(q * np.sign(determinant))
 
 
-def _axes_motion(mechanism: Mechanism, samples: int = 400, size: float = 1.0) -> Motion:
-    """A smooth motion of the motors that the closures allow, with its exact derivatives."""
+def _place(rng: np.random.Generator, joint: int) -> Place:
+    """A random place behind a joint."""
+    rotation = _turn(rng)
+    offset_m = rng.uniform(-0.3, 0.3, 3)
+    return Place(joint, rotation, offset_m)
+
+
+def _home(robot: Robot) -> FloatArray:
+    """Positions of the motors at the assembly pose, shape (m,)."""
+    position_rad = assemble(robot).position_rad
+    motors = list(robot.axis_joints)
+    return position_rad[motors]
+
+
+def _standing(position_rad: FloatArray) -> Motion:
+    """Axes that stand still at positions."""
+    zero = np.zeros_like(position_rad)
+    return Motion(position_rad, zero, zero)
+
+
+def _full_turns(angle_rad: FloatArray) -> FloatArray:
+    """The full turns in an angle [rad]."""
+    turns = np.round(angle_rad / (2.0 * np.pi))
+    return np.asarray(2.0 * np.pi * turns)
+
+
+def _motor_angles(pose: FloatArray) -> FloatArray:
+    """Motors of the planar platform at poses (x, y, angle), shape (k, 4)."""
+    cranks = []
+    for leg in range(4):
+        crank, _ = leg_angles(pose, leg)
+        cranks.append(crank)
+    return np.stack(cranks, axis=1)
+
+
+def _waves(samples: int) -> Motion:
+    """Three sine waves, each with another frequency and phase, and their exact derivatives."""
     t = np.arange(samples) * STEP_S
     phase = np.arange(3)[:, None]
-    wave = 2.0 * np.pi * (0.6 + 0.35 * phase)
-    phase_sine = np.sin(wave * t + phase)
-    x = size * phase_sine
-    phase_cosine = np.cos(wave * t + phase)
-    v = size * wave * phase_cosine
-    a = -size * wave**2 * np.sin(wave * t + phase)
-    robot = mechanism.robot
-    assembly = assemble(robot)
-    home = assembly.position_rad[list(robot.axis_joints)]
-    if mechanism is not PLANAR:
-        reach = 0.4 if mechanism is FIVE_BAR else 0.06
-        part = slice(len(home))
-        return Motion(
-            *(
-                np.asarray(start + reach * one[part].T)
-                for start, one in ((home, x), (0.0, v), (0.0, a))
-            )
-        )
-    pose, rate, change = (
-        np.asarray((np.array([[0.05], [0.05], [0.3]]) * part).T) for part in (x, v, a)
-    )
+    frequency = 2.0 * np.pi * (0.6 + 0.35 * phase)
+    angle = frequency * t + phase
+    x = np.sin(angle)
+    v = frequency * np.cos(angle)
+    a = -(frequency**2) * np.sin(angle)
+    return Motion(x.T, v.T, a.T)
+
+
+def _axes_motion(mechanism: Mechanism, samples: int = 400) -> Motion:
+    """A smooth motion of the motors that the closures allow, with its exact derivatives."""
+    home = _home(mechanism.robot)
+    waves = _waves(samples)
+    if mechanism is PLANAR:
+        return _platform_motion(waves, home)
+    amplitude = 0.06
+    if mechanism is FIVE_BAR:
+        amplitude = 0.4
+    count = len(home)
+    position_rad = home + amplitude * waves.position_rad[:, :count]
+    velocity_rad_s = amplitude * waves.velocity_rad_s[:, :count]
+    acceleration_rad_s2 = amplitude * waves.acceleration_rad_s2[:, :count]
+    return Motion(position_rad, velocity_rad_s, acceleration_rad_s2)
+
+
+def _platform_motion(waves: Motion, home: FloatArray) -> Motion:
+    """Motion of the motors while the planar platform follows waves.
+
+    Derivatives are differences of fourth order.
+    """
+    amplitude = np.array([0.05, 0.05, 0.3])
+    pose = amplitude * waves.position_rad
+    rate = amplitude * waves.velocity_rad_s
+    change = amplitude * waves.acceleration_rad_s2
     h = 1e-4
-    steps = [pose + k * h * rate + 0.5 * (k * h) ** 2 * change for k in (-2, -1, 0, 1, 2)]
-    at = []
-    for one in steps:
-        at.append(np.stack([leg_angles(one, leg)[0] for leg in range(4)], axis=1))
-    home_difference = home - at[2][0]
-    turns = 2.0 * np.pi * np.round(home_difference / (2.0 * np.pi))
-    velocity = (at[0] - 8.0 * at[1] + 8.0 * at[3] - at[4]) / (12.0 * h)
-    acceleration = (-at[0] + 16.0 * at[1] - 30.0 * at[2] + 16.0 * at[3] - at[4]) / (12.0 * h**2)
-    position_rad = at[2] + turns
+    angles = []
+    for k in (-2, -1, 0, 1, 2):
+        step_s = k * h
+        moved = pose + step_s * rate + 0.5 * step_s**2 * change
+        angles.append(_motor_angles(moved))
+    at_minus_2h, at_minus_h, at_0, at_plus_h, at_plus_2h = angles
+    near_difference = at_plus_h - at_minus_h
+    far_difference = at_plus_2h - at_minus_2h
+    velocity = (8.0 * near_difference - far_difference) / (12.0 * h)
+    near_sum = at_minus_h + at_plus_h
+    far_sum = at_minus_2h + at_plus_2h
+    acceleration = (16.0 * near_sum - 30.0 * at_0 - far_sum) / (12.0 * h**2)
+    position_rad = at_0 + _full_turns(home - at_0[0])
     return Motion(position_rad, velocity, acceleration)
 
 
@@ -92,19 +149,33 @@ def _axes_motion(mechanism: Mechanism, samples: int = 400, size: float = 1.0) ->
 def test_derivatives_of_any_closure(seed: int, directions: list[str]) -> None:
     rng = np.random.default_rng(seed)
     tree = robot_from_urdf(SEVEN_AXES.urdf)
-    joints = tuple(replace(joint, parent=index // 2 - 1) for index, joint in enumerate(tree.joints))
-    ends = [Place(joint, _turn(rng), rng.uniform(-0.3, 0.3, 3)) for joint in (6, 5)]
-    closure = Closure("any", ends[0], ends[1], tuple(directions))
-    closures = (closure,)
-    robot = Robot(joints, tree.gravity_m_s2, closures, (0,))
+    joints = []
+    for index, joint in enumerate(tree.joints):
+        branched = replace(joint, parent=index // 2 - 1)
+        joints.append(branched)
+    first = _place(rng, 6)
+    second = _place(rng, 5)
+    closure = Closure("any", first, second, tuple(directions))
+    robot = Robot(tuple(joints), tree.gravity_m_s2, (closure,), (0,))
     q, v = rng.uniform(-1, 1, (2, 1, 7))
     h = 1e-6
+
     here = loops(robot, q, velocity=v)
-    ahead, behind = (loops(robot, q + sign * h * v) for sign in (1, -1))
+    ahead = loops(robot, q + h * v)
+    behind = loops(robot, q - h * v)
+
+    rate = here.jacobian[0] @ v[0]
     residual_difference = ahead.residual - behind.residual
-    assert here.jacobian[0] @ v[0] == pytest.approx(residual_difference[0] / (2 * h), abs=1e-7)
+    rate_by_difference = residual_difference[0] / (2 * h)
+    assert rate == pytest.approx(rate_by_difference, abs=1e-7)
     jacobian_difference = ahead.jacobian - behind.jacobian
-    assert here.bias[0] == pytest.approx(jacobian_difference[0] @ v[0] / (2 * h), abs=1e-6)
+    bias_by_difference = jacobian_difference[0] @ v[0] / (2 * h)
+    assert here.bias[0] == pytest.approx(bias_by_difference, abs=1e-6)
+
+
+def _velocities(jacobian: FloatArray, joints: FloatArray) -> FloatArray:
+    """Jᵢ q̇ᵢ of each sample, shape (k, c)."""
+    return np.asarray(np.einsum("kcn,kn->kc", jacobian, joints))
 
 
 @pytest.mark.parametrize("mechanism", MECHANISMS, ids=lambda one: one.name)
@@ -116,39 +187,43 @@ def test_joints_follow_with_their_derivatives(mechanism: Mechanism) -> None:
     q = found.joints.position_rad
     v = found.joints.velocity_rad_s
     a = found.joints.acceleration_rad_s2
-    absolute_residual = np.abs(loops(robot, q).residual)
-    assert np.max(absolute_residual) < 1e-11
+    residual = loops(robot, q).residual
+    assert _largest(residual) < 1e-11
     motors = list(robot.axis_joints)
-    difference = q[:, motors] - motion.position_rad
-    largest_absolute_difference = np.max(np.abs(difference))
-    assert largest_absolute_difference < 1e-11
+    motor_difference = q[:, motors] - motion.position_rad
+    assert _largest(motor_difference) < 1e-11
+
     closing = loops(robot, q, velocity=v)
     jacobian = closing.jacobian
-    bias = closing.bias
-    assert np.max(np.abs(np.einsum("kcn,kn->kc", jacobian, v))) < 1e-10
-    absolute_bias = np.abs(np.einsum("kcn,kn->kc", jacobian, a) + bias)
-    assert np.max(absolute_bias) < 1e-9
-    differences = (q[2:] - q[:-2]) / (2 * STEP_S)
-    difference_difference = np.abs(differences - v[1:-1])
-    assert np.max(difference_difference) < 2e-5 * np.max(np.abs(a)) + 1e-4
-    assert np.max(np.abs(np.einsum("kcn,knd->kcd", jacobian, found.to_joints))) < 1e-12
-    assert found.to_motors == pytest.approx(found.to_joints[:, motors])
+    closing_velocity = _velocities(jacobian, v)
+    assert _largest(closing_velocity) < 1e-10
+    closing_acceleration = _velocities(jacobian, a) + closing.bias
+    assert _largest(closing_acceleration) < 1e-9
+    v_by_difference = (q[2:] - q[:-2]) / (2 * STEP_S)
+    velocity_error = v_by_difference - v[1:-1]
+    tolerance = 2e-5 * _largest(a) + 1e-4
+    assert _largest(velocity_error) < tolerance
+
+    per_coordinate = np.einsum("kcn,knd->kcd", jacobian, found.to_joints)
+    assert _largest(per_coordinate) < 1e-12
+    motors_per_coordinate = found.to_joints[:, motors]
+    assert found.to_motors == pytest.approx(motors_per_coordinate)
 
 
 def test_a_pose_does_not_depend_on_what_was_asked_before() -> None:
     motion = _axes_motion(FIVE_BAR, 300)
     robot = FIVE_BAR.robot
     assembly = assemble(robot)
-    whole = follow(robot, assembly, motion).joints.position_rad
-    part = Motion(
-        *(
-            array[77:201]
-            for array in (motion.position_rad, motion.velocity_rad_s, motion.acceleration_rad_s2)
-        )
+    all_rad = follow(robot, assembly, motion).joints.position_rad
+    part = slice(77, 201)
+    part_of_motion = Motion(
+        motion.position_rad[part],
+        motion.velocity_rad_s[part],
+        motion.acceleration_rad_s2[part],
     )
-    position_rad = follow(robot, assembly, part).joints.position_rad
-    position_difference_rad = position_rad - whole[77:201]
-    assert np.max(np.abs(position_difference_rad)) < 1e-11
+    part_rad = follow(robot, assembly, part_of_motion).joints.position_rad
+    position_difference_rad = part_rad - all_rad[part]
+    assert _largest(position_difference_rad) < 1e-11
 
 
 def test_a_model_keeps_a_motion_as_long_as_there_is_room(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -158,40 +233,50 @@ def test_a_model_keeps_a_motion_as_long_as_there_is_room(monkeypatch: pytest.Mon
     assert model.follow(replace(motion)) is first
     velocity_rad_s = 2.0 * motion.velocity_rad_s
     faster = Motion(motion.position_rad, velocity_rad_s, motion.acceleration_rad_s2)
-    assert model.follow(faster).joints.velocity_rad_s == pytest.approx(
-        2.0 * first.joints.velocity_rad_s
-    )
+    faster_rad_s = model.follow(faster).joints.velocity_rad_s
+    first_rad_s = first.joints.velocity_rad_s
+    assert faster_rad_s == pytest.approx(2.0 * first_rad_s)
     assert model.follow(motion) is first
     with pytest.raises(ValueError, match="read-only"):
         first.to_joints[0] = 0.0
     motion.position_rad[7] += 1e-9  # what was followed is not what the array holds now
     moved = model.follow(motion).joints.position_rad
-    assert moved == pytest.approx(first.joints.position_rad, abs=1e-8)
-    assert not np.array_equal(moved[7], first.joints.position_rad[7])
+    unmoved = first.joints.position_rad
+    assert moved == pytest.approx(unmoved, abs=1e-8)
+    assert not np.array_equal(moved[7], unmoved[7])
     monkeypatch.setattr("ident.model.model.REMEMBERED_BYTES", 1000)
     assert model.follow(faster) is not model.follow(faster)
+
+
+def _vector(length_m: float, angle_rad: FloatArray) -> FloatArray:
+    """Vectors of a length in the plane, at angles from its x axis, shape (k, 2)."""
+    cosine = np.cos(angle_rad)
+    sine = np.sin(angle_rad)
+    return length_m * np.stack([cosine, sine], axis=1)
 
 
 def test_five_bar_against_the_circles_that_its_rods_describe() -> None:
     assembly = assemble(FIVE_BAR.robot)
     joints = follow(FIVE_BAR.robot, assembly, _axes_motion(FIVE_BAR)).joints
     found = joints.position_rad
-    index = {joint.name: number for number, joint in enumerate(FIVE_BAR.robot.joints)}
-    left = found[:, index["left-crank"]]
-    right = found[:, index["right-crank"]]
-    ends = [
-        np.stack([side * 0.5 * BASE_M + CRANK_M * np.cos(q), CRANK_M * np.sin(q)], axis=1)
-        for side, q in ((-1, left), (1, right))
-    ]
-    middle = 0.5 * (ends[0] + ends[1])
-    apart = ends[1] - ends[0]
-    apart_norm = np.linalg.norm(apart, axis=1)
-    half = 0.5 * apart_norm
-    across = np.stack([-apart[:, 1], apart[:, 0]], axis=1) / (2.0 * half)[:, None]
-    tip = middle + np.sqrt(ROD_M**2 - half**2)[:, None] * across
-    angle = found[:, index["left-rod"]] + left
-    stacked_angle_cosine = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    assert ends[0] + ROD_M * stacked_angle_cosine == pytest.approx(tip, abs=1e-12)
+    names = [joint.name for joint in FIVE_BAR.robot.joints]
+    left = found[:, names.index("left-crank")]
+    right = found[:, names.index("right-crank")]
+    left_rod = found[:, names.index("left-rod")]
+
+    base = np.array([0.5 * BASE_M, 0.0])
+    left_end = -base + _vector(CRANK_M, left)
+    right_end = base + _vector(CRANK_M, right)
+    middle = 0.5 * (left_end + right_end)
+    apart = right_end - left_end
+    distance = np.linalg.norm(apart, axis=1)
+    half = 0.5 * distance
+    across = np.stack([-apart[:, 1], apart[:, 0]], axis=1)
+    unit_across = across / distance[:, None]
+    height = np.sqrt(ROD_M**2 - half**2)
+    tip = middle + height[:, None] * unit_across
+    rod = _vector(ROD_M, left_rod + left)
+    assert left_end + rod == pytest.approx(tip, abs=1e-12)
 
 
 def test_three_legs_carry_a_platform_that_only_translates() -> None:
@@ -200,30 +285,36 @@ def test_three_legs_carry_a_platform_that_only_translates() -> None:
     joints = follow(robot, assemble(robot), motion).joints
     position_rad = joints.position_rad
     placed = poses(robot, position_rad)
-    matching_number = next(
-        number for number, joint in enumerate(robot.joints) if joint.name == "hand-0"
-    )
-    hand = matching_number + 1
-    assert placed.rotation[hand] == pytest.approx(
-        np.broadcast_to(placed.rotation[hand, 0], (400, 3, 3)), abs=1e-11
-    )
+    names = [joint.name for joint in robot.joints]
+    hand = names.index("hand-0") + 1
+    rotation = placed.rotation[hand]
+    first_rotation = np.broadcast_to(rotation[0], (400, 3, 3))
+    assert rotation == pytest.approx(first_rotation, abs=1e-11)
     # Each rod keeps its length: from its slide to the platform.
     for leg in range(3):
-        at = motion.position_rad[:, leg, None] * np.eye(3)[leg] - SLIDE_M * np.eye(3)[leg]
-        origin_difference_m = placed.origin_m[hand] - at
-        origin_difference_norm_m = np.linalg.norm(origin_difference_m, axis=1)
-        assert origin_difference_norm_m == pytest.approx(SLIDE_M, abs=1e-11)
+        direction = np.eye(3)[leg]
+        slide_m = motion.position_rad[:, leg] - SLIDE_M
+        rod_m = placed.origin_m[hand] - np.outer(slide_m, direction)
+        length_m = np.linalg.norm(rod_m, axis=1)
+        assert length_m == pytest.approx(SLIDE_M, abs=1e-11)
+
+
+def _pinocchio_model(mechanism: Mechanism) -> Any:
+    """The tree without closures."""
+    tree = pin.buildModelFromXML(mechanism.urdf)
+    tree.gravity.linear = np.array(mechanism.gravity_m_s2)
+    return tree
 
 
 def _torque_of_tree(mechanism: Mechanism, joints: Motion) -> FloatArray:
     """Pinocchio's inverse dynamics of the tree without closures, shape (k, n)."""
-    model = pin.buildModelFromXML(mechanism.urdf)
-    model.gravity.linear = np.array(mechanism.gravity_m_s2)
+    model = _pinocchio_model(mechanism)
     data = model.createData()
     states = zip(
         joints.position_rad, joints.velocity_rad_s, joints.acceleration_rad_s2, strict=True
     )
-    return np.stack([pin.rnea(model, data, q, v, a) for q, v, a in states])
+    torques = [pin.rnea(model, data, q, v, a) for q, v, a in states]
+    return np.stack(torques)
 
 
 def _standard(mechanism: Mechanism, model: Model) -> FloatArray:
@@ -235,19 +326,47 @@ def _standard(mechanism: Mechanism, model: Model) -> FloatArray:
     return standard
 
 
+def _motor_torque(model: Model, motion: Motion, standard: FloatArray) -> FloatArray:
+    """Torque of the motors by the regressor, shape (m, k)."""
+    regressor = model.regressor(motion)
+    return np.asarray(np.einsum("mck,c->mk", regressor, standard))
+
+
 @pytest.mark.parametrize("mechanism", MECHANISMS, ids=lambda one: one.name)
 def test_virtual_power_of_the_motors_is_that_of_all_joints(mechanism: Mechanism) -> None:
     model = mechanism.model
     motion = _axes_motion(mechanism, 60)
-    torque = np.einsum("mck,c->mk", model.regressor(motion), _standard(mechanism, model))
+    torque = _motor_torque(model, motion, _standard(mechanism, model))
     followed = model.follow(motion)
     tree = _torque_of_tree(mechanism, followed.joints)
     motors = np.einsum("kmd,mk->kd", followed.to_motors, torque)
     joints = np.einsum("knd,kn->kd", followed.to_joints, tree)
-    motor_difference = np.abs(motors - joints)
-    largest_motor_difference = np.max(motor_difference)
-    largest_absolute_joint = np.max(np.abs(joints))
-    assert largest_motor_difference < 1e-9 * largest_absolute_joint
+    difference = motors - joints
+    assert _largest(difference) < 1e-9 * _largest(joints)
+
+
+def _end_of(tree: Any, link: str) -> tuple[Any, Any]:
+    """Parent joint and placement of a link, in Pinocchio."""
+    number = tree.getFrameId(link, pin.FrameType.BODY)
+    frame = tree.frames[number]
+    return frame.parentJoint, frame.placement
+
+
+def _pinocchio_constraints(tree: Any, mechanism: Mechanism) -> Any:
+    """The closures of a mechanism as constraints of Pinocchio."""
+    constraints = pin.StdVec_RigidConstraintModel()
+    for closure in mechanism.closures:
+        # In a plane, the third translation holds by itself.
+        if len(closure.directions) == 6:
+            kind = pin.ContactType.CONTACT_6D
+        else:
+            kind = pin.ContactType.CONTACT_3D
+        first = _end_of(tree, closure.first)
+        second = _end_of(tree, closure.second)
+        local = pin.ReferenceFrame.LOCAL
+        constraint = pin.RigidConstraintModel(kind, tree, *first, *second, local)
+        constraints.append(constraint)
+    return constraints
 
 
 @pytest.mark.parametrize("mechanism", MECHANISMS, ids=lambda one: one.name)
@@ -257,47 +376,29 @@ def test_constrained_forward_dynamics_returns_the_acceleration(mechanism: Mechan
     """
     model = mechanism.model
     motion = _axes_motion(mechanism, 40)
-    torque = np.einsum("mck,c->km", model.regressor(motion), _standard(mechanism, model))
+    standard = _standard(mechanism, model)
+    torque = _motor_torque(model, motion, standard).T
     joints = model.follow(motion).joints
-    tree = pin.buildModelFromXML(mechanism.urdf)
-    tree.gravity.linear = np.array(mechanism.gravity_m_s2)
+    tree = _pinocchio_model(mechanism)
     data = tree.createData()
-    constraints = pin.StdVec_RigidConstraintModel()
+    constraints = _pinocchio_constraints(tree, mechanism)
     datas = pin.StdVec_RigidConstraintData()
-    for closure in mechanism.closures:
-        # In a plane, the third translation holds by itself.
-        if len(closure.directions) == 6:
-            kind = pin.ContactType.CONTACT_6D
-        else:
-            kind = pin.ContactType.CONTACT_3D
-        ends = [
-            tree.frames[tree.getFrameId(link, pin.FrameType.BODY)]
-            for link in (closure.first, closure.second)
-        ]
-        places: list[Any] = []
-        for end in ends:
-            places.extend((end.parentJoint, end.placement))
-        rigid_constraint_model = pin.RigidConstraintModel(
-            kind, tree, *places, pin.ReferenceFrame.LOCAL
-        )
-        constraints.append(rigid_constraint_model)
     for constraint in constraints:
-        datas.append(constraint.createData())
+        constraint_data = constraint.createData()
+        datas.append(constraint_data)
     pin.initConstraintDynamics(tree, data, constraints, datas)
-    settings = pin.ProximalSettings(1e-13, 1e-10, 200)
-    names = [joint.name for joint in model.robot.axes]
+    proximal = pin.ProximalSettings(1e-13, 1e-10, 200)
+    joint_numbers = [tree.getJointId(joint.name) for joint in model.robot.axes]
+    motor_dofs = [tree.joints[number].idx_v for number in joint_numbers]
     for k in range(40):
         q = joints.position_rad[k]
         v = joints.velocity_rad_s[k]
         applied = np.zeros(tree.nv)
-        for name, one in zip(names, torque[k], strict=True):
-            applied[tree.joints[tree.getJointId(name)].idx_v] = one
-        found = pin.constraintDynamics(tree, data, q, v, applied, constraints, datas, settings)
+        applied[motor_dofs] = torque[k]
+        found = pin.constraintDynamics(tree, data, q, v, applied, constraints, datas, proximal)
         expected = joints.acceleration_rad_s2[k]
-        difference = np.abs(found - expected)
-        largest_difference = np.max(difference)
-        largest_absolute_expected = np.max(np.abs(expected))
-        assert largest_difference < TOLERANCE * largest_absolute_expected
+        difference = found - expected
+        assert _largest(difference) < TOLERANCE * _largest(expected)
 
 
 @pytest.mark.parametrize("mechanism", MECHANISMS, ids=lambda one: one.name)
@@ -305,18 +406,19 @@ def test_short_cuts_agree_with_the_regressor(mechanism: Mechanism) -> None:
     model = mechanism.model
     motion = _axes_motion(mechanism, 30)
     standard = _standard(mechanism, model)
-    load, _, whole = model.torques(motion, standard)
-    torque = np.einsum("mck,c->mk", model.regressor(motion), standard)
+    load, _, total = model.torques(motion, standard)
+    torque = _motor_torque(model, motion, standard)
     assert load == pytest.approx(torque, rel=1e-9, abs=1e-9)
-    assert whole == pytest.approx(torque, rel=1e-9, abs=1e-9)
+    assert total == pytest.approx(torque, rel=1e-9, abs=1e-9)
     # Of a redundant drive not all motors at will, which would tear the platform apart, but as its
     # coordinates move.
     to_motors = model.follow(motion).to_motors
     per_x = to_motors.sum(axis=2)
     acceleration_rad_s2 = motion.acceleration_rad_s2 + per_x
     faster = Motion(motion.position_rad, motion.velocity_rad_s, acceleration_rad_s2)
-    change = np.einsum("mck,c->mk", model.regressor(faster), standard) - torque
-    found = np.einsum("mjk,kj->mk", model.inertia(motion.position_rad, standard), per_x)
+    change = _motor_torque(model, faster, standard) - torque
+    inertia = model.inertia(motion.position_rad, standard)
+    found = np.einsum("mjk,kj->mk", inertia, per_x)
     assert found == pytest.approx(change, rel=1e-8, abs=1e-9)
 
 
@@ -338,6 +440,12 @@ def _wrong(mechanism: Mechanism, **changes: Any) -> Robot:
     return replace(mechanism, **changes).robot
 
 
+def _stretched_rad() -> float:
+    """Angle of the right crank of the five-bar where both rods are in one line."""
+    cosine = (2.0 * ROD_M - BASE_M) / (2.0 * CRANK_M)
+    return float(np.arccos(cosine))
+
+
 def test_bad_descriptions_are_refused_by_name() -> None:
     assembly_rad = {"left-crank": 3.1, "right-crank": 0.0}
     with pytest.raises(
@@ -354,11 +462,12 @@ def test_bad_descriptions_are_refused_by_name() -> None:
     with pytest.raises(ModelError, match="left-crank do not move all 2 degrees of freedom"):
         assemble(robot)
     # Both rods in one line: the tip can move across it while the cranks stay.
-    low = float(np.arccos((2.0 * ROD_M - BASE_M) / (2.0 * CRANK_M)))
+    low = _stretched_rad()
     high = np.pi - low
     stretched = {"left-crank": high, "left-rod": -high, "right-crank": low, "right-rod": high}
+    singular = _wrong(FIVE_BAR, assembly_rad=stretched)
     with pytest.raises(ModelError, match="the robot is singular at the assembly pose"):
-        assemble(_wrong(FIVE_BAR, assembly_rad=stretched))
+        assemble(singular)
     closures = (LinkPair("tip", "nowhere", "right-tip", ("x",)),)
     with pytest.raises(ModelError, match="names link 'nowhere'"):
         _wrong(FIVE_BAR, closures=closures)
@@ -369,10 +478,10 @@ def test_bad_descriptions_are_refused_by_name() -> None:
         ModelError, match="two motors drive left-crank; expected a joint of its own for each"
     ):
         assemble(_wrong(FIVE_BAR, motors=motors))
+    far_rad = {"left-crank": np.radians(3.6e9), "right-crank": 0.0}
+    far = _wrong(FIVE_BAR, assembly_rad=far_rad)
     with pytest.raises(ModelError, match=r"left-crank at 3.6e\+09°; expected -360° to 360°"):
-        assemble(
-            _wrong(FIVE_BAR, assembly_rad={"left-crank": np.radians(3.6e9), "right-crank": 0.0})
-        )
+        assemble(far)
     link_pair = LinkPair("tip", "left-tip", "right-tip", ("q",))
     with pytest.raises(ModelError, match="directions q; expected some of x, y, z, rx, ry, rz"):
         _wrong(FIVE_BAR, closures=(link_pair,))
@@ -387,8 +496,7 @@ def test_motors_of_a_redundant_drive_that_do_not_fit_each_other_are_named() -> N
     axes = replace(motion, position_rad=turned)
     with pytest.raises(
         ModelError,
-        match=r"motors do not fit each other at .*: .* away from where "
-        r"the others hold it",
+        match=r"motors do not fit each other at .*: .* away from where the others hold it",
     ):
         follow(robot, assembly, axes)
     # What an encoder or a bent arm makes is no wrong zero.
@@ -396,76 +504,65 @@ def test_motors_of_a_redundant_drive_that_do_not_fit_each_other_are_named() -> N
     shaken = motion.position_rad + rng.normal(0.0, 1e-3, turned.shape)
     changed_motion = replace(motion, position_rad=shaken)
     to_motors = follow(robot, assembly, changed_motion).to_motors
-    assert to_motors.shape == (
-        30,
-        4,
-        3,
-    )
+    assert to_motors.shape == (30, 4, 3)
 
 
 @pytest.mark.parametrize("mechanism", MECHANISMS, ids=lambda one: one.name)
 def test_the_assembly_pose_has_the_condition_of_a_motion_there(mechanism: Mechanism) -> None:
     robot = mechanism.robot
     assembly = assemble(mechanism.robot)
-    home = assembly.position_rad[None, list(robot.axis_joints)]
-    velocity_rad_s = 0.0 * home
-    acceleration_rad_s2 = 0.0 * home
-    axes = Motion(home, velocity_rad_s, acceleration_rad_s2)
+    home = _home(robot)[None]
+    axes = _standing(home)
     found = follow(robot, assembly, axes)
+    reached = reach(robot, assembly, home)
     assert found.condition == pytest.approx(assembly.condition)
-    assert reach(robot, assembly, home).condition == pytest.approx(assembly.condition)
+    assert reached.condition == pytest.approx(assembly.condition)
 
 
 def test_a_redundant_drive_train_is_diagonal() -> None:
-    ratio = 5.0 * np.eye(4)[[1, 0, 2, 3]]
+    order = [1, 0, 2, 3]
+    ratio = 5.0 * np.eye(4)[order]
+    drive_train = DriveTrain(ratio)
     with pytest.raises(ModelError, match="expected a diagonal drive train"):
-        Model(PLANAR.robot, DriveTrain(ratio))
+        Model(PLANAR.robot, drive_train)
 
 
 def test_a_position_out_of_reach_is_named() -> None:
-    motion = Motion(*(np.array([[3.1, 0.0]]) for _ in range(3)))
+    out_of_reach = np.array([[3.1, 0.0]])
+    motion = Motion(out_of_reach, out_of_reach, out_of_reach)
     assembly = assemble(FIVE_BAR.robot)
     with pytest.raises(
-        ModelError,
-        match=r"the loops cannot be closed at left-crank .*, "
-        r"right-crank ",
+        ModelError, match=r"the loops cannot be closed at left-crank .*, right-crank "
     ):
         follow(FIVE_BAR.robot, assembly, motion)
 
 
 def test_a_motion_through_a_singularity_is_refused_with_the_pose() -> None:
-    low = float(np.arccos((2.0 * ROD_M - BASE_M) / (2.0 * CRANK_M))) + 1e-7
-    position_rad = assemble(FIVE_BAR.robot).position_rad
-    home = position_rad[list(FIVE_BAR.robot.axis_joints)]
-    grid = np.linspace(0.0, 1.0, 200)
-    way = grid[:, None]
-    difference = np.array([np.pi - low, low]) - home
-    motion = home + way * difference
-    velocity_rad_s = 0.0 * motion
-    acceleration_rad_s2 = 0.0 * motion
-    axes = Motion(motion, velocity_rad_s, acceleration_rad_s2)
+    low = _stretched_rad() + 1e-7
+    home = _home(FIVE_BAR.robot)
+    singular = np.array([np.pi - low, low])
+    way = np.linspace(0.0, 1.0, 200)
+    motion = home + np.outer(way, singular - home)
+    axes = _standing(motion)
     assembly = assemble(FIVE_BAR.robot)
     with pytest.raises(
-        ModelError,
-        match=r"close to a singularity at left-crank 2.73, "
-        r"right-crank 0.41",
+        ModelError, match=r"close to a singularity at left-crank 2.73, right-crank 0.41"
     ):
         follow(FIVE_BAR.robot, assembly, axes)
 
 
 def test_the_planar_platform_is_where_its_legs_hold_it() -> None:
     pose = np.array([[0.03, -0.02, 0.2]])
-    motors = np.stack([leg_angles(pose, leg)[0] for leg in range(4)], axis=1)
-    position_rad = assemble(PLANAR.robot).position_rad
-    home = position_rad[list(PLANAR.robot.axis_joints)]
-    motors += 2.0 * np.pi * np.round((home - motors) / (2.0 * np.pi))
-    velocity_rad_s = 0 * motors
-    acceleration_rad_s2 = 0 * motors
-    axes = Motion(motors, velocity_rad_s, acceleration_rad_s2)
+    motors = _motor_angles(pose)
+    home = _home(PLANAR.robot)
+    motors += _full_turns(home - motors)
+    axes = _standing(motors)
     assembly = assemble(PLANAR.robot)
     found = follow(PLANAR.robot, assembly, axes).joints.position_rad
-    turned = {joint.name: value for joint, value in zip(PLANAR.robot.joints, found[0], strict=True)}
-    assert turned["motor-0"] + turned["elbow-0"] + turned["platform"] == pytest.approx(0.2)
+    names = [joint.name for joint in PLANAR.robot.joints]
+    turned = dict(zip(names, found[0], strict=True))
+    platform_rad = turned["motor-0"] + turned["elbow-0"] + turned["platform"]
+    assert platform_rad == pytest.approx(0.2)
 
 
 @pytest.mark.slow
@@ -481,7 +578,7 @@ def test_every_pose_of_a_recording_is_reached_from_the_assembly_pose(mechanism: 
     assert smooth.closed.all()
     assert apart.closed.all()
     position_difference_rad = apart.position_rad - smooth.position_rad[::97]
-    assert np.max(np.abs(position_difference_rad)) < 1e-8
+    assert _largest(position_difference_rad) < 1e-8
 
 
 PARALLELOGRAM = """<robot name="lifter">
@@ -497,6 +594,14 @@ PARALLELOGRAM = """<robot name="lifter">
 </robot>"""  # noqa: E501
 
 
+def _check_follower(joints: FloatArray, axes: FloatArray) -> None:
+    """Check that the axes are where they were put, and the rod turns back as J2 turns."""
+    driven = joints[:, [0, 1, 3]]
+    rod = joints[:, 2]
+    np.testing.assert_allclose(driven, axes, atol=TOLERANCE)
+    np.testing.assert_allclose(rod, -axes[:, 1], atol=1e-8)
+
+
 def test_a_follower_is_described_by_one_closure_of_a_direction() -> None:
     """What the refusal of <mimic> proposes: the forearm keeps its direction,
     so its joint turns back as J2 turns.
@@ -505,14 +610,12 @@ def test_a_follower_is_described_by_one_closure_of_a_direction() -> None:
     motors = ("J1", "J2", "J4")
     robot = robot_from_urdf(PARALLELOGRAM, closures=(keeps,), motors=motors)
     rng = np.random.default_rng(5)
-    axes = Motion(*(rng.uniform(-0.8, 0.8, (20, 3)) for _ in range(3)))
+    position_rad = rng.uniform(-0.8, 0.8, (20, 3))
+    velocity_rad_s = rng.uniform(-0.8, 0.8, (20, 3))
+    acceleration_rad_s2 = rng.uniform(-0.8, 0.8, (20, 3))
+    axes = Motion(position_rad, velocity_rad_s, acceleration_rad_s2)
     assembly = assemble(robot, 3)
     joints = follow(robot, assembly, axes).joints
-    for found, wanted in (
-        (joints.position_rad, axes.position_rad),
-        (joints.velocity_rad_s, axes.velocity_rad_s),
-        (joints.acceleration_rad_s2, axes.acceleration_rad_s2),
-    ):
-        np.testing.assert_allclose(found[:, [0, 1, 3]], wanted, atol=TOLERANCE)
-        expected = -wanted[:, 1]
-        np.testing.assert_allclose(found[:, 2], expected, atol=1e-8)
+    _check_follower(joints.position_rad, axes.position_rad)
+    _check_follower(joints.velocity_rad_s, axes.velocity_rad_s)
+    _check_follower(joints.acceleration_rad_s2, axes.acceleration_rad_s2)
