@@ -136,8 +136,11 @@ class ScriptedNode:
             (0x6084, 0): (1000, 4),
         }
         for number in range(4):
-            self._add_pdo(0x1400 + number, 0x200 + 0x100 * number, 0x60400010)
-            self._add_pdo(0x1800 + number, 0x180 + 0x100 * number, 0x60410010)
+            cob = 0x200 + 0x100 * number
+            self._add_pdo(0x1400 + number, cob, 0x60400010)
+        for number in range(4):
+            cob = 0x180 + 0x100 * number
+            self._add_pdo(0x1800 + number, cob, 0x60410010)
 
     def _add_pdo(self, communication: int, cob: int, mapped: int) -> None:
         """Add the objects of a PDO with one entry; those of the third and fourth are not valid."""
@@ -294,8 +297,6 @@ class ScriptedNode:
         upper = self.statusword & ~0x6F
         rising = word & ~self._previous_control
         self._previous_control = word
-        if word & 0x06 == 0x02 and state & 0x4F != 0x08:  # quick stop
-            self.moving = False
         state = self._next_state(state, word, rising)
         self.statusword = upper | state
         if state != 0x27:
@@ -321,17 +322,20 @@ class ScriptedNode:
     def _next_state(self, state: int, word: int, rising: int) -> int:
         """State after a controlword, by the table of CiA 402."""
         if state & 0x4F == 0x08:  # fault
-            return 0x40 if rising & 0x80 else state
-        if word & 0x02 == 0:
-            return 0x40
-        if word & 0x06 == 0x02:  # quick stop
-            return 0x07 if state in (0x27, 0x07) else 0x40
-        if word & 0x0F == 0x06:
-            return 0x21 if state in (0x40, 0x21, 0x23, 0x27) else state
-        if word & 0x0F == 0x07:
-            return 0x23 if state in (0x21, 0x23, 0x27) else state
-        if word & 0x0F == 0x0F:
-            return 0x27 if state in (0x23, 0x27) else state
+            if rising & 0x80:
+                state = 0x40
+        elif word & 0x02 == 0:
+            state = 0x40
+        elif word & 0x06 == 0x02:  # quick stop
+            state = 0x07 if state in (0x27, 0x07) else 0x40
+        elif word & 0x0F == 0x06:
+            if state in (0x40, 0x21, 0x23, 0x27):
+                state = 0x21
+        elif word & 0x0F == 0x07:
+            if state in (0x21, 0x23, 0x27):
+                state = 0x23
+        elif word & 0x0F == 0x0F and state in (0x23, 0x27):
+            state = 0x27
         return state
 
     def _move(self) -> None:
@@ -416,7 +420,7 @@ class ScriptedBus(can.BusABC):
             for answer in node.on_sync(self.cycle, bool(data)):
                 self._answer(answer)
         elif cob == 0:
-            self._command_nmt(node, *data)
+            self._command_nmt(node, data[0], data[1])
         elif cob == 0x600 + node.node_id and node.nmt != 4:
             reply = node.sdo(data)
             if reply is not None:
@@ -430,8 +434,8 @@ class ScriptedBus(can.BusABC):
             node.nmt = states[command]
 
     def _beat(self) -> None:
-        now_ns = self.clock.now_ns
         for node in self.nodes:
+            now_ns = self.clock.now_ns
             period_ms = 0
             if node.has(0x1017, 0):
                 period_ms = node.value(0x1017, 0)
