@@ -68,8 +68,14 @@ def until(page: Page, condition: str) -> None:
         }};
         look();
     }})""")
-    body = page.inner_text("body")
-    assert found, f"not within {HEARD_S:g} s: {condition}\n{body}"
+    if not found:
+        body = page.inner_text("body")
+        pytest.fail(f"not within {HEARD_S:g} s: {condition}\n{body}")
+
+
+def text_of(element: str) -> str:
+    """The text of an element of the page, in its script."""
+    return f"document.getElementById('{element}').textContent"
 
 
 def note_complaints(page: Page, complaints: list[str]) -> None:
@@ -80,8 +86,16 @@ def note_complaints(page: Page, complaints: list[str]) -> None:
 
 def plan_command(cell_file: Path, out: Path, duration_s: str) -> list[str]:
     """Arguments that plan moves without improving them."""
-    plan = ["plan", str(cell_file), "--out", str(out)]
-    return [*plan, "--duration", duration_s, "--exchanges", "0"]
+    return [
+        "plan",
+        str(cell_file),
+        "--out",
+        str(out),
+        "--duration",
+        duration_s,
+        "--exchanges",
+        "0",
+    ]
 
 
 def paragraph(stream: IO[str]) -> list[str]:
@@ -167,9 +181,14 @@ class Rig:
 
     def record(self) -> subprocess.Popen[str]:
         """Begin a recording."""
-        cell_and_plan = (str(self.cell_file), str(self.plan))
-        log = str(self.log)
-        return self.start("record", *cell_and_plan, "--out", log, "--enable-motion")
+        return self.start(
+            "record",
+            str(self.cell_file),
+            str(self.plan),
+            "--out",
+            str(self.log),
+            "--enable-motion",
+        )
 
     def kept(self) -> Log:
         """The log, or what was saved of it."""
@@ -481,10 +500,11 @@ def _pictures(made: Rig, browser: Browser, checkout: Path) -> None:
 
 
 def _made_block(number: int, role: str) -> Block:
-    payload = "disc"
-    mass_kg = 4.59
-    if role == "bare":
-        payload = mass_kg = None
+    payload = None
+    mass_kg = None
+    if role != "bare":
+        payload = "disc"
+        mass_kg = 4.59
     return Block(
         name=f"block-{number}-{role}",
         payload=payload,
@@ -495,11 +515,24 @@ def _made_block(number: int, role: str) -> Block:
 
 
 def _made_run(name: str) -> RecordedRun:
-    return RecordedRun(name=name, sha256="", attempts=1, samples=1, lost_cycles=0, missing=())
+    return RecordedRun(
+        name=name,
+        sha256="",
+        attempts=1,
+        samples=1,
+        lost_cycles=0,
+        missing=(),
+    )
 
 
 def _made_gain(axis: str, unit: str) -> GainSoFar:
-    return GainSoFar(axis=axis, unit=unit, value=10.0, std_percent=0.9, target_percent=0.5)
+    return GainSoFar(
+        axis=axis,
+        unit=unit,
+        value=10.0,
+        std_percent=0.9,
+        target_percent=0.5,
+    )
 
 
 def _state_after_three_blocks(cell: Cell, folder: Path) -> None:
@@ -536,7 +569,13 @@ def test_the_session_shows_the_gains_after_each_move(
     for axis in cell.axes:
         gains.append(QuickGain(axis.name, axis.gain_unit, 10.0, 0.8, 0.5))
     look = QuickLook(
-        "block-4-loaded", 1, 9, 44.0, gains=gains, why="it needs more moves", left_s=69.0
+        "block-4-loaded",
+        1,
+        9,
+        44.0,
+        gains=gains,
+        why="it needs more moves",
+        left_s=69.0,
     )
     feed = Feed(cell_file)
     accepted = arrivals(feed)
@@ -547,7 +586,7 @@ def test_the_session_shows_the_gains_after_each_move(
         page = context.new_page()
         address = f"http://127.0.0.1:{console.port}/{TOKEN}/"
         page.goto(address)
-        until(page, "document.getElementById('next-step').textContent.startsWith('DISC')")
+        until(page, f"{text_of('next-step')}.startsWith('DISC')")
         # A console is connected before the feed accepts it: what is published in between is for
         # nobody.
         assert accepted.wait(HEARD_S)
@@ -558,10 +597,10 @@ def test_the_session_shows_the_gains_after_each_move(
             changed_look = replace(look, move=number, motion_s=motion_s)
             feed.look(changed_look)
             recording.run(50)
-            outlook = "document.getElementById('outlook').textContent"
-            until(page, f"{outlook}.includes('after move {number} of 9')")
+            until(page, f"{text_of('outlook')}.includes('after move {number} of 9')")
         assert page.inner_text("#next-step") == "The robot moves: block-4-loaded"
-        assert "J1 is worst (it needs more moves): about 69 s left" in page.inner_text("#outlook")
+        outlook = page.inner_text("#outlook")
+        assert "J1 is worst (it needs more moves): about 69 s left" in outlook
         # One point of the block that was judged and two of moves since, for each axis.
         axis_count = len(cell.axes)
         points = page.locator("#precision circle")
@@ -569,7 +608,7 @@ def test_the_session_shows_the_gains_after_each_move(
         assert points.count() == 3 * axis_count
         assert quick_points.count() == 2 * axis_count
         feed.finish()
-        until(page, "document.getElementById('next-step').textContent.startsWith('DISC')")
+        until(page, f"{text_of('next-step')}.startsWith('DISC')")
 
 
 BLOCK_S = "10"
@@ -583,7 +622,11 @@ class Technician:
         self.command = command
         self.mounted = mounted
         self.said = ""
-        self.answers = {"Mass of": "4.59", "The same once more": "4.59", "Type yes": "yes"}
+        self.answers = {
+            "Mass of": "4.59",
+            "The same once more": "4.59",
+            "Type yes": "yes",
+        }
 
     def asked(self) -> str | None:
         """The next question; None at the end of the command."""
@@ -644,9 +687,17 @@ def test_a_whole_session_is_shown_as_its_files_hold_it(
     with ExitStack() as stack:
         made = Rig(tmp_path, checkout, browser, stack, "", SHORT_S, simulated)
         page = made.page
-        options = ("--enable-motion", "--block", BLOCK_S, "--target", TARGET_PERCENT)
+        arguments = (
+            "calibrate",
+            str(made.cell_file),
+            "--enable-motion",
+            "--block",
+            BLOCK_S,
+            "--target",
+            TARGET_PERCENT,
+        )
         command = subprocess.Popen(
-            [*DRIVEGAIN, "calibrate", str(made.cell_file), *options],
+            [*DRIVEGAIN, *arguments],
             cwd=checkout,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
@@ -658,18 +709,17 @@ def test_a_whole_session_is_shown_as_its_files_hold_it(
         while (question := technician.asked()) is not None:
             if "press Enter" in question and "cell" in question:
                 step = technician.asked_for()
-                next_step = "document.getElementById('next-step').textContent"
-                until(page, f"{next_step}.startsWith('{step}')")
+                until(page, f"{text_of('next-step')}.startsWith('{step}')")
                 technician.mount()
                 _precision_is_that_of(page, newest_state(made.cell_file, made.cell))
             elif question.startswith("Type yes"):
-                until(page, "document.getElementById('next-step').textContent.includes('type yes')")
+                until(page, f"{text_of('next-step')}.includes('type yes')")
             technician.answer(question)
         assert command.stdout is not None
         ending = command.stdout.read().decode()
         exit_code = command.wait(timeout=60)
         assert exit_code == ExitCode.OK, technician.said + ending
-        until(page, "document.getElementById('stage').textContent.startsWith('Stage: ended')")
+        until(page, f"{text_of('stage')}.startsWith('Stage: ended')")
         state = newest_state(made.cell_file, made.cell)
         assert state.acceptance is not None
         outlook = page.inner_text("#outlook")
