@@ -155,7 +155,7 @@ def test_pieces_of_a_short_recording_stay_in_the_fold_of_their_move(small: Evide
 def _verdicts(problem: SearchProblem) -> list[tuple[object, ...]]:
     """What a search with one seed says of each candidate."""
     rng = np.random.default_rng(4)
-    verdicts = []
+    verdicts: list[tuple[object, ...]] = []
     for finding in rank_effects(problem, rng, GATES):
         candidate = (finding.effect, finding.axis)
         verdicts.append((*candidate, finding.probability, finding.left_out_fall))
