@@ -324,8 +324,8 @@ def test_a_correction_is_said_once_for_logs_that_share_a_description(
     assert corrections == [("robot.gravity_m_s2",), ("robot.gravity_m_s2",)]
     # As the calibration keeps it.
     calibration = replace(demo_calibration(), sources=sources)
-    content = encode_calibration(calibration)
-    decoded = decode_calibration(content, "calibration.yaml")
+    encoded = encode_calibration(calibration)
+    decoded = decode_calibration(encoded, "calibration.yaml")
     assert decoded.sources == sources
 
 

@@ -973,9 +973,9 @@ def test_a_body_that_was_there_from_the_beginning_costs_every_block(
 
 def made_block(name: str, payload: str | None) -> Block:
     """A recorded block, weighed where it has a payload."""
-    mass_kg = MASS_KG
-    if payload is None:
-        mass_kg = None
+    mass_kg = None
+    if payload is not None:
+        mass_kg = MASS_KG
     return Block(name=name, payload=payload, mass_kg=mass_kg, holdout=False, plan="")
 
 

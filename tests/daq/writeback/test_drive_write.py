@@ -343,10 +343,9 @@ def test_an_abort_on_axis_3_puts_the_old_values_back_and_saves_them(
             r"(2003h:01|1010h:01): aborted",
         ) as caught:
             _write(cell, address)
-        restored = AXES[:3]
+        names = ", ".join(AXES[:3])
         if kind is FaultKind.REFUSES_SAVE:
-            restored = AXES
-        names = ", ".join(restored)
+            names = ", ".join(AXES)
         notes = caught.value.__notes__
         assert notes == [f"kept: the previous values are restored in {names}"]
         assert _gains(simulation) == IN_DRIVES
