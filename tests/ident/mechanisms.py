@@ -17,6 +17,10 @@ from ident.model.urdf import LinkPair, robot_from_urdf
 FloatArray = NDArray[np.float64]
 
 
+DOWNWARD = (0.0, 0.0, -9.81)
+"""Gravity along −z [m/s²]."""
+
+
 @dataclass(frozen=True, eq=False)
 class Mechanism:
     """A URDF with its closures, and where its motors may go.
@@ -39,7 +43,7 @@ class Mechanism:
     mobility: int
     gains: FloatArray
     assembly_rad: Mapping[str, float] = field(default_factory=dict)
-    gravity_m_s2: tuple[float, float, float] = (0.0, 0.0, -9.81)
+    gravity_m_s2: tuple[float, float, float] = DOWNWARD
 
     @property
     def robot(self) -> Robot:
@@ -77,7 +81,8 @@ class _Urdf:
         """
         self.count += 1
         mass = 0.4 + 0.17 * self.count
-        along = 0.03 + 0.01 * (self.count % 5)
+        place_of_mass = self.count % 5
+        along = 0.03 + 0.01 * place_of_mass
         origin = f'<origin xyz="{xyz}" rpy="{rpy}"/>'
         inertial = f'<origin xyz="{along} 0.01 -0.02"/><mass value="{mass}"/>'
         self.parts.append(
@@ -170,12 +175,11 @@ def _five_bar() -> Mechanism:
 
 
 LEG_M = 0.28
-LEGS = (
-    (-0.35, -0.1, -1.0),
-    (-0.35, 0.1, 1.0),
-    (0.35, -0.1, 1.0),
-    (0.35, 0.1, -1.0),
-)
+LEFT_FRONT = (-0.35, -0.1, -1.0)
+LEFT_BACK = (-0.35, 0.1, 1.0)
+RIGHT_FRONT = (0.35, -0.1, 1.0)
+RIGHT_BACK = (0.35, 0.1, -1.0)
+LEGS = (LEFT_FRONT, LEFT_BACK, RIGHT_FRONT, RIGHT_BACK)
 """Base (x, y) of each leg of the planar platform [m], and the side to which its elbow points."""
 HALF_M = 0.1  #: Half the length of the platform: two legs hold each of its ends
 
@@ -228,8 +232,9 @@ def _planar() -> Mechanism:
         assembly_rad[elbow] = float(elbow_angles[0])
         if leg == 0:
             urdf.hinge("platform", elbow, link_end)
-            leg_rad = assembly_rad[crank] + assembly_rad[elbow]
-            assembly_rad["platform"] = -leg_rad
+            crank_rad = assembly_rad[crank]
+            elbow_rad = assembly_rad[elbow]
+            assembly_rad["platform"] = -crank_rad - elbow_rad
         else:
             urdf.frame(f"tip-{leg}", elbow, link_end)
     # Leg 0 carries the platform; leg 1 is at the same end of it, legs 2 and 3 at the other.
@@ -288,8 +293,9 @@ def _three_legs() -> Mechanism:
         urdf.frame(f"centre-{leg}", hand, "0 0 0")
     # The frames of the legs are turned against each other: a frame of leg 0 in the directions of
     # leg n.
-    urdf.frame("seat-1", "hand-0", rpy=directions[1])
-    urdf.frame("seat-2", "hand-0", rpy=directions[2])
+    _, second, third = directions
+    urdf.frame("seat-1", "hand-0", rpy=second)
+    urdf.frame("seat-2", "hand-0", rpy=third)
     rigid = ("x", "y", "z", "rx", "ry", "rz")
     parallelogram_0 = LinkPair("parallelogram 0", "coupler-end-0", "bar-end-0", PLANE)
     parallelogram_1 = LinkPair("parallelogram 1", "coupler-end-1", "bar-end-1", PLANE)

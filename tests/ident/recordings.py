@@ -40,7 +40,8 @@ _PAYLOAD_MOMENT = (-0.24, -0.25, 0.39)
 _PAYLOAD_VALUES = (*_PAYLOAD_INERTIA, *_PAYLOAD_MOMENT, 4.59)
 PAYLOAD_TRUTH = dict(zip(LINK_PARAMETERS, _PAYLOAD_VALUES, strict=True))
 MOUNTED = Payload("disc", "a", {"m": 4.59})
-CONDITIONING = Conditioning(standstill_rad_s=(0.03,) * 6)
+STANDSTILL_RAD_S = (0.03,) * 6
+CONDITIONING = Conditioning(standstill_rad_s=STANDSTILL_RAD_S)
 MOVE_S = 1.1
 RAMP_S = 0.9
 LIMITS_RAD = (2.5, 1.8, 2.2, 3.0, 1.8, 3.0, 2.0)
@@ -228,7 +229,8 @@ def record(
     straight = positions(rng, seconds, drawn_hz, limits)
     drawn = bend(straight)
     q = drawn[::averaged]
-    time = np.arange(len(q)) / rate_hz
+    samples = np.arange(len(q))
+    time = samples / rate_hz
     current_a = np.zeros_like(q)
     bare = Run(name, time, q, current_a)
     # The recorded positions are band-limited far below this cut-off, so these derivatives are the

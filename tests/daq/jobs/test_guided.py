@@ -1378,7 +1378,7 @@ def test_a_log_that_is_damaged_before_the_end_is_recorded_again_in_its_place(
 
 
 ENTER = ("", "")
-"""A person who has mounted what is asked for, and lets the robot move."""
+"""A person who has mounted the payload, and lets the robot move."""
 WEIGHED = ("4.59", "4.59")
 TO_THE_WRITE = (*ENTER, *WEIGHED, *ENTER, *ENTER)
 """What a person types before the gains are to be written."""
@@ -1420,7 +1420,7 @@ def test_a_person_who_answers_every_prompt_calibrates(
 
 
 @pytest.mark.parametrize("answer", ["Yes", "YES", "y\nyes"])
-def test_yes_in_either_case_writes_and_a_slip_is_repeated(
+def test_yes_in_either_case_writes_and_a_slip_is_asked_again(
     tmp_path: Path,
     made_session: MadeSession,
     monkeypatch: pytest.MonkeyPatch,
@@ -1467,7 +1467,7 @@ def test_keep_in_either_case_keeps_a_block(
     assert sys.stdin.read() == ""
 
 
-def test_the_mass_is_repeated_until_it_is_the_same_twice(
+def test_the_mass_is_asked_again_until_it_is_the_same_twice(
     tmp_path: Path,
     made_session: MadeSession,
     monkeypatch: pytest.MonkeyPatch,

@@ -37,7 +37,7 @@ def give_guard(node: ScriptedNode, entry: int = 0, option: int | None = 1) -> No
 
 
 def guarded_cell() -> tuple[CanopenNetwork, ScriptedBus]:
-    """Two axes that can watch the recorder, and watch nobody yet."""
+    """Two axes that can watch the recorder, and watch no node yet."""
     network, bus = cell(2)
     for node in bus.nodes:
         give_guard(node)
