@@ -31,11 +31,12 @@ from drivers.profiles.profile import (
 
 PERIOD_NS = 1_000_000
 ADDRESS = BusAddress("virtual", "scripted")
+CURRENT_SCALE = CurrentScale(1e-6, (ObjectEntry(0x6075, 0, 32, signed=False),))
 PROFILE = DriveProfile(
     name="generic",
     position=ObjectEntry(0x6064, 0, 32, signed=True),
     current=ObjectEntry(0x6074, 0, 16, signed=True),
-    current_scale=CurrentScale(1e-6, (ObjectEntry(0x6075, 0, 32, signed=False),)),
+    current_scale=CURRENT_SCALE,
     amplitude=Amplitude.RMS,
     tap=TapPoint.REFERENCE,
     saturation_bit=11,
@@ -45,6 +46,22 @@ PROFILE = DriveProfile(
 )
 
 Tamper = Callable[[can.Message], Iterable[can.Message]]
+
+
+def frame(cob_id: int, data: bytes = b"") -> can.Message:
+    """A frame with an identifier of 11 bits."""
+    return can.Message(arbitration_id=cob_id, is_extended_id=False, data=data)
+
+
+def abort_answer(index: int, sub: int, code: int) -> bytes:
+    """Answer of an SDO server that refuses."""
+    return struct.pack("<BHBL", 0x80, index, sub, code)
+
+
+def little_endian(value: int, size: int) -> bytes:
+    """A value as the frames carry it; negative values as two's complement."""
+    mask = (1 << 8 * size) - 1
+    return (value & mask).to_bytes(size, "little")
 
 
 class FakeClock:
@@ -83,9 +100,14 @@ class ScriptedNode:
         self.aborts: dict[tuple[int, int], int] = {}
         self.read_aborts: dict[tuple[int, int], int] = {}
         self.lies: dict[tuple[int, int], int] = {}
-        self.obeys_nmt = self.beats = True
-        self.quick_stop_stays = self.ignores_setpoint = self.second_controlword = False
-        self.holds_acknowledge = self.keeps_acknowledge = self.acts_at_once = False
+        self.obeys_nmt = True
+        self.beats = True
+        self.quick_stop_stays = False
+        self.ignores_setpoint = False
+        self.second_controlword = False
+        self.holds_acknowledge = False
+        self.keeps_acknowledge = False
+        self.acts_at_once = False
         self.largest_pdo_bits = 64
         self.powered_cycles = 0
         self.setpoint_cycles: list[int] = []
@@ -93,7 +115,7 @@ class ScriptedNode:
         self._pending: dict[int, bytes] = {}
         self._previous_control = 0
         self._rising_seen = 0
-        o: dict[tuple[int, int], tuple[int, int]] = {
+        self.objects: dict[tuple[int, int], tuple[int, int]] = {
             (0x1000, 0): (0x00020192, 4),
             (0x1008, 0): (int.from_bytes(b"axis", "little"), 4),
             (0x1017, 0): (0, 2),
@@ -113,18 +135,25 @@ class ScriptedNode:
             (0x6083, 0): (1000, 4),
             (0x6084, 0): (1000, 4),
         }
-        for base, cob in ((0x1400, 0x200), (0x1800, 0x180)):
-            for number in range(4):
-                o[base + number, 1] = (
-                    cob + 0x100 * number + node_id | (0 if number < 2 else 1 << 31),
-                    4,
-                )
-                o[base + number, 2] = (255, 1)
-                o[base + 0x200 + number, 0] = (1, 1)
-                for sub in range(1, 9):
-                    default = 0x60400010 if base == 0x1400 else 0x60410010
-                    o[base + 0x200 + number, sub] = (default if sub == 1 else 0, 4)
-        self.objects = o
+        for number in range(4):
+            cob = 0x200 + 0x100 * number
+            self._add_pdo(0x1400 + number, cob, 0x60400010)
+        for number in range(4):
+            cob = 0x180 + 0x100 * number
+            self._add_pdo(0x1800 + number, cob, 0x60410010)
+
+    def _add_pdo(self, communication: int, cob: int, mapped: int) -> None:
+        """Add the objects of a PDO with one entry; those of the third and fourth are not valid."""
+        mapping = communication + 0x200
+        cob_id = cob + self.node_id
+        if communication & 3 >= 2:
+            cob_id |= 1 << 31
+        self.objects[communication, 1] = (cob_id, 4)
+        self.objects[communication, 2] = (255, 1)
+        self.objects[mapping, 0] = (1, 1)
+        self.objects[mapping, 1] = (mapped, 4)
+        for sub in range(2, 9):
+            self.objects[mapping, sub] = (0, 4)
 
     def has(self, index: int, sub: int) -> bool:
         return (index, sub) in self.objects
@@ -133,59 +162,89 @@ class ScriptedNode:
         return self.objects[index, sub][0]
 
     def store(self, index: int, sub: int, value: int) -> None:
-        self.objects[index, sub] = (value, self.objects[index, sub][1])
+        size = self.objects[index, sub][1]
+        self.objects[index, sub] = (value, size)
 
     def sdo(self, data: bytes) -> bytes | None:
         command, index, sub = struct.unpack_from("<BHB", data)
         if command == 0x80:
             return None
         if not self.has(index, sub):
-            return struct.pack("<BHBL", 0x80, index, sub, 0x06020000)
-        _, size = self.objects[index, sub]
-        if command == 0x40 and (index, sub) in self.read_aborts:
-            return struct.pack("<BHBL", 0x80, index, sub, self.read_aborts[index, sub])
+            return abort_answer(index, sub, 0x06020000)
         if command == 0x40:
-            self._refresh()
-            value = self.lies.get((index, sub), self.value(index, sub))
-            answer = struct.pack("<BHB", 0x43 | (4 - size) << 2, index, sub)
-            return answer + (value & (1 << 8 * size) - 1).to_bytes(size, "little").ljust(4, b"\0")
-        length = 4 - (command >> 2 & 3)
-        abort = self.aborts.get((index, sub)) or (
-            0x06070010 if length != size else self._mapping_abort(index, sub, data)
-        )
+            return self._upload(index, sub)
+        return self._download(index, sub, data)
+
+    def _upload(self, index: int, sub: int) -> bytes:
+        key = (index, sub)
+        if key in self.read_aborts:
+            return abort_answer(index, sub, self.read_aborts[key])
+        self._refresh()
+        value, size = self.objects[key]
+        value = self.lies.get(key, value)
+        command = 0x43 | (4 - size) << 2
+        answer = struct.pack("<BHB", command, index, sub)
+        return answer + little_endian(value, size).ljust(4, b"\0")
+
+    def _download(self, index: int, sub: int, data: bytes) -> bytes:
+        key = (index, sub)
+        _, size = self.objects[key]
+        length = 4 - (data[0] >> 2 & 3)
+        abort = self.aborts.get(key)
+        if not abort and length != size:
+            abort = 0x06070010
+        if not abort:
+            abort = self._mapping_abort(index, sub, data)
         if abort:
-            return struct.pack("<BHBL", 0x80, index, sub, abort)
-        self.store(index, sub, int.from_bytes(data[4 : 4 + size], "little"))
-        if (index, sub) == (0x6060, 0):
+            return abort_answer(index, sub, abort)
+        content = data[4 : 4 + size]
+        self.store(index, sub, int.from_bytes(content, "little"))
+        if key == (0x6060, 0):
             self.store(0x6061, 0, self.value(0x6060, 0))
-        if (index, sub) == (0x6040, 0):
+        if key == (0x6040, 0):
             self.control(self.value(0x6040, 0), 0)
         return struct.pack("<BHBL", 0x60, index, sub, 0)
 
     def _mapping_abort(self, index: int, sub: int, data: bytes) -> int:
         """CiA 301: a mapping changes only while its PDO is not valid and its count is 0."""
-        if not (0x1600 <= index < 0x1800 or 0x1A00 <= index < 0x1C00):
+        is_mapping = 0x1600 <= index < 0x1800 or 0x1A00 <= index < 0x1C00
+        if not is_mapping:
             return 0
-        if not self.value(index - 0x200, 1) >> 31:
+        cob_id = self.value(index - 0x200, 1)
+        if not cob_id >> 31:
             return 0x06090030
+        count = self.value(index, 0)
+        if sub and count:
+            return 0x06010000
         if sub:
-            return 0x06010000 if self.value(index, 0) else 0
-        entries = range(data[4])
-        bits = sum(self.value(index, entry + 1) & 0xFF for entry in entries if data[4] <= 8)
-        return 0x06040042 if bits > self.largest_pdo_bits else 0
+            return 0
+        new_count = data[4]
+        bits = 0
+        if new_count <= 8:
+            for entry in range(new_count):
+                bits += self.value(index, entry + 1) & 0xFF
+        if bits > self.largest_pdo_bits:
+            return 0x06040042
+        return 0
 
     def _refresh(self) -> None:
-        for key, value in (((0x6041, 0), self.statusword), ((0x6064, 0), round(self.position))):
-            if self.has(*key):
-                self.store(*key, value)
+        self._report(0x6041, self.statusword)
+        self._report(0x6064, round(self.position))
+
+    def _report(self, index: int, value: int) -> None:
+        if self.has(index, 0):
+            self.store(index, 0, value)
 
     def _mapped(self, base: int, number: int) -> list[tuple[int, int, int]]:
-        words = []
-        for sub in range(self.value(base + 0x200 + number, 0)):
-            words.append(self.value(base + 0x200 + number, sub + 1))
+        """Index, subindex and size [bytes] of what a PDO carries."""
+        mapping = base + 0x200 + number
         found = []
-        for w in words:
-            found.append((w >> 16, w >> 8 & 0xFF, (w & 0xFF) // 8))
+        for entry in range(self.value(mapping, 0)):
+            word = self.value(mapping, entry + 1)
+            index = word >> 16
+            sub = word >> 8 & 0xFF
+            bits = word & 0xFF
+            found.append((index, sub, bits // 8))
         return found
 
     def receive_pdo(self, cob_id: int, data: bytes) -> None:
@@ -197,25 +256,26 @@ class ScriptedNode:
     def on_sync(self, cycle: int, counted: bool = False) -> list[can.Message]:
         if self.nmt != 5:
             return []
-        if self.has(0x1019, 0) and self.value(0x1019, 0) and not counted:
+        counts = self.has(0x1019, 0) and self.value(0x1019, 0)
+        if counts and not counted:
             return [self.emcy(0x8240)]  # CiA 301: unexpected SYNC data length
         answers = []
         for number in range(4):
-            cob, kind = self.value(0x1800 + number, 1), self.value(0x1800 + number, 2)
+            cob = self.value(0x1800 + number, 1)
+            kind = self.value(0x1800 + number, 2)
             if not cob >> 31 and kind == 1:
-                self._refresh()
-                data = b"".join(
-                    (self.value(i, s) & (1 << 8 * n) - 1).to_bytes(n, "little")
-                    for i, s, n in self._mapped(0x1800, number)
-                )
-                arbitration_id = cob & 0x7FF
-                message = can.Message(
-                    arbitration_id=arbitration_id, is_extended_id=False, data=data
-                )
-                answers.append(message)
+                content = self._tpdo_content(number)
+                answers.append(frame(cob & 0x7FF, content))
         self._apply_pdos(cycle)
         self._move()
         return answers
+
+    def _tpdo_content(self, number: int) -> bytes:
+        self._refresh()
+        content = b""
+        for index, sub, size in self._mapped(0x1800, number):
+            content += little_endian(self.value(index, sub), size)
+        return content
 
     def _apply_pdos(self, cycle: int) -> None:
         for number in range(4):
@@ -225,18 +285,42 @@ class ScriptedNode:
                 continue
             offset = 0
             for index, sub, size in self._mapped(0x1400, number):
-                self.store(
-                    index,
-                    sub,
-                    int.from_bytes(pdo[offset : offset + size], "little", signed=index == 0x607A),
-                )
+                part = pdo[offset : offset + size]
+                is_signed = index == 0x607A
+                self.store(index, sub, int.from_bytes(part, "little", signed=is_signed))
                 offset += size
             if number == 0:
                 self.control(self.value(0x6040, 0), cycle)
 
     def control(self, word: int, cycle: int) -> None:
-        state, upper = self.statusword & 0x6F, self.statusword & ~0x6F
-        rising, self._previous_control = word & ~self._previous_control, word
+        state = self.statusword & 0x6F
+        upper = self.statusword & ~0x6F
+        rising = word & ~self._previous_control
+        self._previous_control = word
+        state = self._next_state(state, word, rising)
+        self.statusword = upper | state
+        if state != 0x27:
+            self.moving = False
+            return
+        if not word & 0x10:
+            self._rising_seen = 0
+            must_keep = self.holds_acknowledge and self.moving
+            if not self.keeps_acknowledge and not must_keep:
+                self.statusword &= ~0x1000
+            return
+        self._rising_seen += 1
+        must_be_said_again = self.second_controlword and self._rising_seen < 2
+        is_acknowledged = self.statusword & 0x1000
+        if self.ignores_setpoint or must_be_said_again or is_acknowledged:
+            return
+        self.statusword |= 0x1000
+        self.statusword &= ~0x0400
+        self.target = self.value(0x607A, 0)
+        self.moving = True
+        self.setpoint_cycles.append(cycle)
+
+    def _next_state(self, state: int, word: int, rising: int) -> int:
+        """State after a controlword, by the table of CiA 402."""
         if state & 0x4F == 0x08:  # fault
             if rising & 0x80:
                 state = 0x40
@@ -244,56 +328,44 @@ class ScriptedNode:
             state = 0x40
         elif word & 0x06 == 0x02:  # quick stop
             state = 0x07 if state in (0x27, 0x07) else 0x40
-            self.moving = False
         elif word & 0x0F == 0x06:
-            state = 0x21 if state in (0x40, 0x21, 0x23, 0x27) else state
+            if state in (0x40, 0x21, 0x23, 0x27):
+                state = 0x21
         elif word & 0x0F == 0x07:
-            state = {0x21: 0x23, 0x23: 0x23, 0x27: 0x23}.get(state, state)
-        elif word & 0x0F == 0x0F:
-            state = {0x23: 0x27, 0x27: 0x27}.get(state, state)
-        self.statusword = upper | state
-        if state != 0x27:
-            self.moving = False
-            return
-        if not word & 0x10:
-            if not self.keeps_acknowledge and not (self.holds_acknowledge and self.moving):
-                self.statusword &= ~0x1000
-            self._rising_seen = 0
-            return
-        self._rising_seen += 1
-        if (
-            self.ignores_setpoint
-            or (self.second_controlword and self._rising_seen < 2)
-            or self.statusword & 0x1000
-        ):
-            return
-        self.statusword = (self.statusword | 0x1000) & ~0x0400
-        self.target, self.moving = self.value(0x607A, 0), True
-        self.setpoint_cycles.append(cycle)
+            if state in (0x21, 0x23, 0x27):
+                state = 0x23
+        elif word & 0x0F == 0x0F and state in (0x23, 0x27):
+            state = 0x27
+        return state
 
     def _move(self) -> None:
         state = self.statusword & 0x6F
         self.powered_cycles += state in (0x27, 0x07)
         if state == 0x07 and not self.quick_stop_stays:
-            self.statusword = self.statusword & ~0x6F | 0x40
-        if self.moving:
-            step = self.value(0x6081, 0) * PERIOD_NS * 1e-9
-            way = self.target - self.position
-            self.position += max(-step, min(step, way))
-            if self.position == self.target:
-                self.moving = False
-                self.statusword |= 0x0400
-                if self.holds_acknowledge and not self._previous_control & 0x10:
-                    self.statusword &= ~0x1000
+            self.statusword &= ~0x6F
+            self.statusword |= 0x40
+        if not self.moving:
+            return
+        step = self.value(0x6081, 0) * PERIOD_NS * 1e-9
+        way = self.target - self.position
+        self.position += max(-step, min(step, way))
+        if self.position == self.target:
+            self.moving = False
+            self.statusword |= 0x0400
+            is_setpoint_gone = not self._previous_control & 0x10
+            if self.holds_acknowledge and is_setpoint_gone:
+                self.statusword &= ~0x1000
 
     def fault(self, following_error: bool = False) -> None:
-        self.statusword = self.statusword & ~0x6F | 0x08 | (0x2000 if following_error else 0)
+        self.statusword &= ~0x6F
+        self.statusword |= 0x08
+        if following_error:
+            self.statusword |= 0x2000
         self.moving = False
 
     def emcy(self, code: int) -> can.Message:
         data = struct.pack("<HB5x", code, 1)
-        arbitration_id = 0x80 + self.node_id
-        return can.Message(arbitration_id=arbitration_id, is_extended_id=False, data=data)
+        return frame(0x80 + self.node_id, data)
 
 
 class ScriptedBus(can.BusABC):
@@ -333,68 +405,81 @@ class ScriptedBus(can.BusABC):
         if self.broken:
             raise can.CanOperationError("the wire was cut")
         self.sent.append(msg)
-        cob, data = msg.arbitration_id, bytes(msg.data)
+        cob = msg.arbitration_id
+        data = bytes(msg.data)
         if cob == 0x80:
             self.cycle += 1
             self.clock.now_ns += PERIOD_NS // 4
             self.on_cycle(self.cycle)
         for node in self.nodes:
-            if cob == 0x80:
-                for answer in node.on_sync(self.cycle, bool(data)):
-                    self._answer(answer)
-            elif cob == 0 and data[1] in (0, node.node_id) and node.obeys_nmt:
-                node.nmt = {1: 5, 2: 4, 128: 127}[data[0]]
-            elif cob == 0x600 + node.node_id and node.nmt != 4:
-                reply = node.sdo(data)
-                if reply is not None:
-                    arbitration_id = 0x580 + node.node_id
-                    message = can.Message(
-                        arbitration_id=arbitration_id, is_extended_id=False, data=reply
-                    )
-                    self._answer(message)
-            elif 0x200 <= cob < 0x600 and cob & 0x7F == node.node_id:
-                node.receive_pdo(cob, data)
+            self._deliver(node, cob, data)
         self._beat()
+
+    def _deliver(self, node: ScriptedNode, cob: int, data: bytes) -> None:
+        if cob == 0x80:
+            for answer in node.on_sync(self.cycle, bool(data)):
+                self._answer(answer)
+        elif cob == 0:
+            self._command_nmt(node, data[0], data[1])
+        elif cob == 0x600 + node.node_id and node.nmt != 4:
+            reply = node.sdo(data)
+            if reply is not None:
+                self._answer(frame(0x580 + node.node_id, reply))
+        elif 0x200 <= cob < 0x600 and cob & 0x7F == node.node_id:
+            node.receive_pdo(cob, data)
+
+    def _command_nmt(self, node: ScriptedNode, command: int, node_id: int) -> None:
+        states = {1: 5, 2: 4, 128: 127}
+        if node_id in (0, node.node_id) and node.obeys_nmt:
+            node.nmt = states[command]
 
     def _beat(self) -> None:
         for node in self.nodes:
-            period_ms = node.value(0x1017, 0) if node.has(0x1017, 0) else 0
-            if node.beats and period_ms and self.clock.now_ns >= node.next_beat_ns:
-                node.next_beat_ns = self.clock.now_ns + period_ms * 1_000_000
-                data = bytes((node.nmt,))
-                arbitration_id = 0x700 + node.node_id
-                message = can.Message(
-                    arbitration_id=arbitration_id, is_extended_id=False, data=data
-                )
-                self._answer(message)
+            now_ns = self.clock.now_ns
+            period_ms = 0
+            if node.has(0x1017, 0):
+                period_ms = node.value(0x1017, 0)
+            if node.beats and period_ms and now_ns >= node.next_beat_ns:
+                node.next_beat_ns = now_ns + period_ms * 1_000_000
+                state = bytes((node.nmt,))
+                self._answer(frame(0x700 + node.node_id, state))
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
         if self.broken:
             raise can.CanOperationError("the wire was cut")
-        end_ns = self.clock.now_ns + round((timeout or 0.0) * 1e9)
+        timeout_s = timeout or 0.0
+        end_ns = self.clock.now_ns + round(timeout_s * 1e9)
         while not self._queue and self.clock.now_ns < end_ns:
-            self.clock.now_ns = min(end_ns, self.clock.now_ns + PERIOD_NS)
+            next_ns = self.clock.now_ns + PERIOD_NS
+            self.clock.now_ns = min(end_ns, next_ns)
             self._beat()
-        return (self._queue.popleft() if self._queue else None), True
+        if self._queue:
+            return self._queue.popleft(), True
+        return None, True
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
         self.clock.now_ns += self.flood_period_ns
-        message = self._recv_internal(timeout)[0]
+        message, _ = self._recv_internal(timeout)
         if message is None and self.flood_period_ns:
-            return can.Message(arbitration_id=0x7FF, is_extended_id=False)
+            return frame(0x7FF)
         return message
 
 
 def cell(axes: int = 2) -> tuple[CanopenNetwork, ScriptedBus]:
     """A network of so many axes, not yet entered, and the bus that it will open."""
     clock = FakeClock()
-    nodes = tuple(ScriptedNode(n + 1) for n in range(axes))
-    bus = ScriptedBus(nodes, clock)
+    identity = Identity(0x29A, 0x40200, 7)
     bounds = Bounds(0.1, 0.1, 0.1, 0.1)
     policy = SdoPolicy(0.02, 2)
+    nodes = []
+    network_axes = []
+    for number in range(1, axes + 1):
+        nodes.append(ScriptedNode(number))
+        network_axes.append(Axis(f"J{number}", number, PROFILE, identity))
+    bus = ScriptedBus(tuple(nodes), clock)
     network = CanopenNetwork(
         ADDRESS,
-        tuple(Axis(f"J{n + 1}", n + 1, PROFILE, Identity(0x29A, 0x40200, 7)) for n in range(axes)),
+        tuple(network_axes),
         heartbeat_ms=20,
         bounds=bounds,
         policy=policy,
@@ -405,23 +490,23 @@ def cell(axes: int = 2) -> tuple[CanopenNetwork, ScriptedBus]:
 
 
 def lose_first_answer(bus: ScriptedBus, *, repeats: bool) -> None:
-    """Hold node 1's first SDO answer back; it comes before its second answer,
+    """Delay node 1's first SDO answer; it comes before its second answer,
     and if so before every one after that.
     """
-    held: list[can.Message] = []
+    withheld: list[can.Message] = []
     released = False
 
     def tamper(message: can.Message) -> tuple[can.Message, ...]:
         nonlocal released
         if message.arbitration_id != 0x581:
             return (message,)
-        if not held:
-            held.append(message)
+        if not withheld:
+            withheld.append(message)
             return ()
         if released and not repeats:
             return (message,)
         released = True
-        return (held[0], message)
+        return (withheld[0], message)
 
     bus.tamper = tamper
 

@@ -17,32 +17,34 @@ from ident.data.dataset import Dataset, differentiate
 from ident.data.run import Run
 from ident.discovery.candidates import ColumnCache, SearchProblem, prepare_search
 from ident.discovery.evidence import Evidence, gather
+from ident.effects.effect import PlacedEffect
 from ident.effects.signals import session_began_s
 from ident.equations.linearisation import Jacobian
 from ident.equations.rows import decimate_rows
-from ident.estimators.estimate import RelativeError, relative_error
+from ident.estimators.estimate import Estimate, RelativeError, relative_error
 from ident.estimators.identify import identify
 from ident.estimators.maximum_likelihood import ml
 from ident.estimators.payload_mass import mass_responses
 from ident.model.bodies import LINK_PARAMETERS, Payload
 from ident.model.model import DriveTrain, Model
 from ident.model.urdf import robot_from_urdf
-from tests.ident.arms import GANTRY, POLAR, THREE_AXES, TX40
+from tests.ident.arms import GANTRY, POLAR, THREE_AXES, TX40, Arm
 
 FloatArray = NDArray[np.float64]
 
 RATIO = np.diag([32.0, 32.0, 45.0, -48.0, 45.0, 32.0])
 RATIO[5, 4] = 32.0
 GAINS = np.array([33.9, 32.4, 24.2, -9.21, 16.3, 6.79])
-PAYLOAD_TRUTH = dict(
-    zip(
-        LINK_PARAMETERS,
-        (0.08, -0.012, 0.022, 0.082, 0.032, 0.052, -0.24, -0.25, 0.39, 4.59),
-        strict=True,
-    )
-)
+_PAYLOAD_INERTIA = (0.08, -0.012, 0.022, 0.082, 0.032, 0.052)
+_PAYLOAD_MOMENT = (-0.24, -0.25, 0.39)
+_PAYLOAD_VALUES = (*_PAYLOAD_INERTIA, *_PAYLOAD_MOMENT, 4.59)
+PAYLOAD_TRUTH = dict(zip(LINK_PARAMETERS, _PAYLOAD_VALUES, strict=True))
 MOUNTED = Payload("disc", "a", {"m": 4.59})
-CONDITIONING = Conditioning(standstill_rad_s=(0.03,) * 6)
+STANDSTILL_RAD_S = (0.03,) * 6
+CONDITIONING = Conditioning(standstill_rad_s=STANDSTILL_RAD_S)
+MOVE_S = 1.1
+RAMP_S = 0.9
+LIMITS_RAD = (2.5, 1.8, 2.2, 3.0, 1.8, 3.0, 2.0)
 
 
 @dataclass(frozen=True)
@@ -54,8 +56,16 @@ class Truth:
     gains: FloatArray
 
 
+def _model_of(arm: Arm, ratio: FloatArray) -> Model:
+    """An arm with the gears of its motors."""
+    robot = robot_from_urdf(arm.urdf)
+    drive_train = DriveTrain(ratio)
+    return Model(robot, drive_train)
+
+
 def tx40_truth(seed: int = 0) -> Truth:
     """The TX-40-like arm with friction of the paper's size."""
+    model = _model_of(TX40, RATIO)
     masses = (10.0, 3.7, 4.1, 3.4, 1.0, 0.2)
     friction = (
         (0.35, 7.0, 5.5),
@@ -65,8 +75,6 @@ def tx40_truth(seed: int = 0) -> Truth:
         (0.05, 1.1, 2.6),
         (0.01, 0.25, 0.6),
     )
-    robot = robot_from_urdf(TX40.urdf)
-    model = Model(robot, DriveTrain(RATIO))
     rng = np.random.default_rng(seed)
     parameters = _parameters(model, masses, friction, rng)
     parameters[-3:] = (0.0104, 0.47, 1.7)
@@ -80,9 +88,12 @@ def three_axes_truth() -> Truth:
     elasticity and backlash speak of, and would make them look smaller than they are.
     """
     ratio = np.diag([40.0, 50.0, -45.0])
-    robot = robot_from_urdf(THREE_AXES.urdf)
-    model = Model(robot, DriveTrain(ratio))
-    friction = ((0.03, 7.0, 5.5), (0.03, 4.4, 7.7), (0.02, 1.6, 6.3))
+    model = _model_of(THREE_AXES, ratio)
+    friction = (
+        (0.03, 7.0, 5.5),
+        (0.03, 4.4, 7.7),
+        (0.02, 1.6, 6.3),
+    )
     rng = np.random.default_rng(2)
     masses = (10.0, 5.0, 3.0)
     parameters = _parameters(model, masses, friction, rng)
@@ -93,8 +104,7 @@ def three_axes_truth() -> Truth:
 def gantry_truth() -> Truth:
     """Three linear axes with a wrist of two, the arm in an upright gravity."""
     ratio = np.diag([120.0, 120.0, 150.0, 40.0, 50.0])
-    robot = robot_from_urdf(GANTRY.urdf)
-    model = Model(robot, DriveTrain(ratio))
+    model = _model_of(GANTRY, ratio)
     friction = (
         (8.0, 20.0, 15.0),
         (6.0, 15.0, 12.0),
@@ -114,9 +124,13 @@ def gantry_truth() -> Truth:
 def polar_truth() -> Truth:
     """A turntable, a joint that lifts the arm, a slide along it, and a wrist."""
     ratio = np.diag([40.0, 50.0, 120.0, 40.0])
-    robot = robot_from_urdf(POLAR.urdf)
-    model = Model(robot, DriveTrain(ratio))
-    friction = ((0.03, 7.0, 5.5), (0.03, 4.4, 7.7), (3.0, 20.0, 15.0), (0.02, 1.6, 4.0))
+    model = _model_of(POLAR, ratio)
+    friction = (
+        (0.03, 7.0, 5.5),
+        (0.03, 4.4, 7.7),
+        (3.0, 20.0, 15.0),
+        (0.02, 1.6, 4.0),
+    )
     masses = (12.0, 8.0, 5.0, 3.0)
     rng = np.random.default_rng(2)
     parameters = _parameters(model, masses, friction, rng)
@@ -132,15 +146,23 @@ def _parameters(
 ) -> FloatArray:
     """Links of these masses around random centres; Ia, fv and fs of each joint."""
     parameters = np.zeros(len(model.columns))
-    for joint, (mass, drive) in enumerate(zip(masses, friction, strict=True)):
+    upper = np.triu_indices(3)
+    for joint, mass in enumerate(masses):
+        drive = friction[joint]
         centre = rng.uniform(-0.1, 0.1, 3)
         centre_outer = np.outer(centre, centre)
-        inertia = mass * (np.eye(3) * (0.05**2 + centre @ centre) - centre_outer)
-        parameters[14 * joint : 14 * joint + 6] = inertia[np.triu_indices(3)]
-        parameters[14 * joint + 6 : 14 * joint + 9] = mass * centre
-        parameters[14 * joint + 9] = mass
-        parameters[14 * joint + 10 : 14 * joint + 13] = drive
-        parameters[14 * joint + 13] = rng.uniform(-0.3, 0.3)
+        square = 0.05**2 + centre @ centre
+        isotropic = np.eye(3) * square
+        inertia = mass * (isotropic - centre_outer)
+        first = 14 * joint
+        of_joint = parameters[first : first + 14]
+        of_joint[:6] = inertia[upper]
+        moment = mass * centre
+        of_joint[6:9] = moment
+        of_joint[9] = mass
+        of_joint[10:13] = drive
+        offset = rng.uniform(-0.3, 0.3)
+        of_joint[13] = offset
     return parameters
 
 
@@ -149,21 +171,25 @@ def positions(
 ) -> FloatArray:
     """Point-to-point moves with smooth ramps and no dwell, shape (k, n)."""
     count = round(seconds * rate_hz)
-    knots = rng.uniform(-1.0, 1.0, (round(seconds / 1.1) + 2, len(limits))) * limits
-    repeated_knots = np.repeat(knots, round(1.1 * rate_hz), axis=0)
+    move_count = round(seconds / MOVE_S) + 2
+    samples_a_move = round(MOVE_S * rate_hz)
+    shape = (move_count, len(limits))
+    shares = rng.uniform(-1.0, 1.0, shape)
+    knots = shares * limits
+    repeated_knots = np.repeat(knots, samples_a_move, axis=0)
     stairs = repeated_knots[:count]
-    window = np.hanning(round(0.9 * rate_hz))
-    repeated_stairs = np.repeat(stairs[-1:], len(window), axis=0)
-    padded = np.concatenate(
-        (
-            np.repeat(stairs[:1], len(window), axis=0),
-            stairs,
-            repeated_stairs,
-        )
-    )
-    return np.asarray(
-        signal.fftconvolve(padded, (window / window.sum())[:, None], mode="same", axes=0)
-    )[len(window) : len(window) + count]
+    margin = round(RAMP_S * rate_hz)
+    window = np.hanning(margin)
+    first = stairs[:1]
+    last = stairs[-1:]
+    before = np.repeat(first, margin, axis=0)
+    after = np.repeat(last, margin, axis=0)
+    padded = np.concatenate((before, stairs, after))
+    weights = window / window.sum()
+    column = weights[:, None]
+    smooth = signal.fftconvolve(padded, column, mode="same", axes=0)
+    end = margin + count
+    return np.asarray(smooth)[margin:end]
 
 
 def record(
@@ -195,13 +221,16 @@ def record(
         bend: the motion that is made, of the positions that are drawn.
     """
     drawn_hz = rate_hz
-    averaged = averaged or (4 if drawn_hz == 1000.0 else 1)
+    if not averaged:
+        averaged = 4 if drawn_hz == 1000.0 else 1
     rate_hz = drawn_hz / averaged
     count = len(truth.gains)
-    limits = np.array([2.5, 1.8, 2.2, 3.0, 1.8, 3.0, 2.0][:count])
-    drawn = bend(positions(rng, seconds, drawn_hz, limits))
+    limits = np.array(LIMITS_RAD[:count])
+    straight = positions(rng, seconds, drawn_hz, limits)
+    drawn = bend(straight)
     q = drawn[::averaged]
-    time = np.arange(len(q)) / rate_hz
+    samples = np.arange(len(q))
+    time = samples / rate_hz
     current_a = np.zeros_like(q)
     bare = Run(name, time, q, current_a)
     # The recorded positions are band-limited far below this cut-off, so these derivatives are the
@@ -212,13 +241,19 @@ def record(
     columns = truth.model.regressor(data.motion())
     parameters = truth.parameters.copy()
     if payload is not None:
-        parameters[truth.model.flange] += [PAYLOAD_TRUTH[p] for p in LINK_PARAMETERS]
+        flange = truth.model.flange
+        carried = list(PAYLOAD_TRUTH.values())
+        parameters[flange] += carried
     torque = np.einsum("jck,c->jk", columns, parameters)
+    motor_torque = truth.model.drive_train.to_motor @ torque
+    gains = truth.gains[:, None]
+    needed = motor_torque / gains
     current = np.zeros_like(q)
-    to_motor = truth.model.drive_train.to_motor
-    current[1:-1] = ((to_motor @ torque) / truth.gains[:, None]).T
+    current[1:-1] = needed.T
     noise = noise_a * rng.standard_normal(drawn.shape)
-    current += np.add.reduceat(noise, np.arange(0, len(noise), averaged)) / averaged
+    starts = np.arange(0, len(noise), averaged)
+    sums = np.add.reduceat(noise, starts)
+    current += sums / averaged
     return Run(name, time, q, current, payload)
 
 
@@ -226,7 +261,8 @@ def gathered(truth: Truth, runs: tuple[Run, ...], holdout: tuple[Run, ...] = ())
     """Identified by ``ml``, with its rows."""
     standstill_rad_s = (0.03,) * len(truth.gains)
     conditioning = replace(CONDITIONING, standstill_rad_s=standstill_rad_s)
-    return gather(identify(truth.model, runs, conditioning, holdout=holdout), runs, holdout)
+    identified = identify(truth.model, runs, conditioning, holdout=holdout)
+    return gather(identified, runs, holdout)
 
 
 def bent(clean: Evidence, truth: Truth, torque_nm: Callable[[Dataset], FloatArray]) -> Evidence:
@@ -238,14 +274,16 @@ def bent(clean: Evidence, truth: Truth, torque_nm: Callable[[Dataset], FloatArra
         truth: of whom the torque asks its current.
         torque_nm: of all joints along a run, shape (n, k).
     """
-    rows = [decimate_rows(data, clean.conditioning, torque_nm(data)) for data in clean.datasets]
+    rows = []
+    for data in clean.datasets:
+        torque = torque_nm(data)
+        of_run = decimate_rows(data, clean.conditioning, torque)
+        rows.append(of_run)
     stacked_rows = np.concatenate(rows, axis=1)
     to_motor = truth.model.drive_train.to_motor
-    added_a = to_motor @ stacked_rows / truth.gains[:, None]
-    return with_current(
-        clean,
-        added_a,
-    )
+    gains = truth.gains[:, None]
+    added_a = to_motor @ stacked_rows / gains
+    return with_current(clean, added_a)
 
 
 def with_current(clean: Evidence, added_a: FloatArray) -> Evidence:
@@ -258,7 +296,9 @@ def with_current(clean: Evidence, added_a: FloatArray) -> Evidence:
 
 def acting_on(axis: int, count: int, torque_nm: FloatArray) -> FloatArray:
     """Torque of one joint, shape (k,), as that of all, shape (n, k)."""
-    return np.asarray(np.eye(count)[axis][:, None] * torque_nm)
+    unit_vector = np.eye(count)[axis]
+    column = unit_vector[:, None]
+    return np.asarray(column * torque_nm)
 
 
 def search_problem_of(evidence: Evidence, cache: ColumnCache | None = None) -> SearchProblem:
@@ -285,55 +325,68 @@ def training_error(evidence: Evidence) -> RelativeError:
 def calibrated(evidence: Evidence) -> Calibration:
     """The calibration that an estimate with its effects amounts to."""
     estimate = evidence.estimate
-    axes = tuple(f"J{number}" for number in range(1, len(estimate.gains) + 1))
-    parameters = tuple(
-        Parameter(column.name, float(value), float(std), column.unit)
-        for column, value, std in zip(
-            estimate.unknowns, estimate.parameters, estimate.parameters_std, strict=True
-        )
-    )
-    effects = []
-    for placed in evidence.effects:
-        names = {column.name for column in placed.columns}
-        coefficients = tuple(parameter for parameter in parameters if parameter.name in names)
-        settings = placed.effect.settings.items()
-        setting = {name: float(value) for name, value in settings}
-        accepted_effect = AcceptedEffect(
-            placed.effect.name, axes[placed.axis], setting, coefficients, 1.0, 1.0
-        )
-        effects.append(accepted_effect)
-    whole = a_calibration(estimate.gains, parameters, estimate.gains_std)
+    parameters = _parameters_of(estimate)
+    effects = tuple(_accepted(placed, parameters) for placed in evidence.effects)
+    calibration = a_calibration(estimate.gains, parameters, estimate.gains_std)
     references = []
-    for one in mass_responses(evidence.identification.system, estimate):
-        gain_per_kg = one.gain_per_kg.tolist()
-        parameters_per_kg = one.parameters_per_kg.tolist()
-        references.append(
-            PayloadMass.of(one.payload, one.mass_kg, gain_per_kg, whole.gains, parameters_per_kg)
+    for response in mass_responses(evidence.identification.system, estimate):
+        reference = PayloadMass.of(
+            response.payload,
+            response.mass_kg,
+            response.gain_per_kg.tolist(),
+            calibration.gains,
+            response.parameters_per_kg.tolist(),
         )
+        references.append(reference)
     covariance_factor = factor_of(estimate.covariance)
     return replace(
-        whole,
+        calibration,
         payload_mass=tuple(references),
-        effects=tuple(effects),
+        effects=effects,
         session_began_s=session_began_s(evidence.fit_runs),
         covariance_factor=covariance_factor,
     )
+
+
+def _parameters_of(estimate: Estimate) -> tuple[Parameter, ...]:
+    """Unknowns of an estimate with their deviations."""
+    values = estimate.parameters.tolist()
+    deviations = estimate.parameters_std.tolist()
+    parameters = []
+    for column, value, std in zip(estimate.unknowns, values, deviations, strict=True):
+        parameter = Parameter(column.name, value, std, column.unit)
+        parameters.append(parameter)
+    return tuple(parameters)
+
+
+def _accepted(placed: PlacedEffect, parameters: tuple[Parameter, ...]) -> AcceptedEffect:
+    """An effect as a calibration has it."""
+    effect = placed.effect
+    names = {column.name for column in placed.columns}
+    coefficients = tuple(parameter for parameter in parameters if parameter.name in names)
+    setting = {name: float(value) for name, value in effect.settings.items()}
+    axis = f"J{placed.axis + 1}"
+    return AcceptedEffect(effect.name, axis, setting, coefficients, 1.0, 1.0)
 
 
 def a_calibration(
     gains: FloatArray, parameters: tuple[Parameter, ...], gains_std: FloatArray | None = None
 ) -> Calibration:
     """A calibration of these gains and parameters, exact unless deviations are given."""
-    std = np.zeros(len(gains)) if gains_std is None else gains_std
+    if gains_std is None:
+        gains_std = np.zeros(len(gains))
+    named_gains = []
+    for index, gain in enumerate(gains.tolist()):
+        name = f"J{index + 1}"
+        std = float(gains_std[index])
+        named_gain = Gain(name, gain, std, "Nm/A", 1.0)
+        named_gains.append(named_gain)
     axes = (0.0,) * len(gains)
     relative_error_percent = RelativeError(axes, 0.0)
     return Calibration(
         cell="test",
         method="ml",
-        gains=tuple(
-            Gain(f"J{number}", float(gain), float(one), "Nm/A", 1.0)
-            for number, (gain, one) in enumerate(zip(gains, std, strict=True), start=1)
-        ),
+        gains=tuple(named_gains),
         parameters=parameters,
         effects=(),
         relative_error_percent=relative_error_percent,

@@ -6,7 +6,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -36,7 +37,7 @@ from tests.daq.calibrations import demo_calibration
 from tests.daq.logs import DISC, demo_content, rising_counts, samples, write
 
 ROWS = samples(rising_counts(60, 6))
-EQUAL_ROWS = samples([[k] * 6 for k in range(60)])
+EQUAL_ROWS = samples([[row] * 6 for row in range(60)])
 
 Change = Callable[[str], str]
 """What changes the text of a cell file."""
@@ -79,22 +80,26 @@ def _replaced(old: str, new: str) -> Change:
 def _calibration(cell: str) -> Calibration:
     """A calibration of a cell with these axes, with every setting of its filter."""
     conditioning = Conditioning(standstill_rad_s=(0.03,) * 6)
-    return replace(demo_calibration(), cell=cell, filter=conditioning.document())
+    settings = conditioning.document()
+    return replace(demo_calibration(), cell=cell, filter=settings)
 
 
 def _calibration_of(cell: Cell) -> Calibration:
     """A calibration of a cell with the name demo, which names its robot."""
-    return replace(_calibration("demo"), robot=calibrated_robot(cell))
+    robot = calibrated_robot(cell)
+    return replace(_calibration("demo"), robot=robot)
 
 
 def _with_first_axis(cell: Cell, axis: CellAxis) -> Cell:
-    return replace(cell, axes=(axis, *cell.axes[1:]))
+    _, *others = cell.axes
+    return replace(cell, axes=(axis, *others))
 
 
 def _with_identity(axis: CellAxis, **changes: int) -> CellAxis:
     """The axis of a drive with another serial number or vendor."""
     assert axis.identity is not None
-    return replace(axis, identity=replace(axis.identity, **changes))
+    identity = replace(axis.identity, **changes)
+    return replace(axis, identity=identity)
 
 
 def _with_a_sliding_joint(cell: Cell) -> Cell:
@@ -102,17 +107,30 @@ def _with_a_sliding_joint(cell: Cell) -> Cell:
     return replace(cell, urdf=urdf)
 
 
-#: a change that makes it another cell, and the message that says by what
-OTHERS: dict[str, tuple[Change, str]] = {
-    "another name": (
-        _replaced("name: demo", "name: press"),
-        "a log of cell 'demo'; expected one of cell 'press'",
-    ),
-    "another axis": (_replaced("name: J2", "name: A2"), "axes J1, J2, .*; expected J1, A2"),
-    "another node": (
-        _replaced("node_id: 3", "node_id: 33"),
-        "drive of J3 with node id 3; expected drive of J3 with node id 33",
-    ),
+@dataclass(frozen=True)
+class OtherCell:
+    """A change that makes it another cell or robot, and what the message says of it."""
+
+    change: Change
+    message: str
+
+
+ANOTHER_NAME = OtherCell(
+    _replaced("name: demo", "name: press"),
+    "a log of cell 'demo'; expected one of cell 'press'",
+)
+ANOTHER_AXIS = OtherCell(
+    _replaced("name: J2", "name: A2"),
+    "axes J1, J2, .*; expected J1, A2",
+)
+ANOTHER_NODE = OtherCell(
+    _replaced("node_id: 3", "node_id: 33"),
+    "drive of J3 with node id 3; expected drive of J3 with node id 33",
+)
+OTHERS = {
+    "another name": ANOTHER_NAME,
+    "another axis": ANOTHER_AXIS,
+    "another node": ANOTHER_NODE,
 }
 
 
@@ -120,9 +138,9 @@ OTHERS: dict[str, tuple[Change, str]] = {
 def test_another_cell_is_refused_with_what_shows_it(
     kind: str, checkout: Path, tmp_path: Path, log: Path
 ) -> None:
-    change, message = OTHERS[kind]
-    other = load_cell(_copy(checkout, tmp_path, change))
-    message += ".*another robot's description gives wrong gains"
+    case = OTHERS[kind]
+    other = load_cell(_copy(checkout, tmp_path, case.change))
+    message = f"{case.message}.*another robot's description gives wrong gains"
     with pytest.raises(LogsDiffer, match=message):
         load_run(log, other)
 
@@ -161,8 +179,10 @@ def test_a_robot_with_another_number_of_axes_and_the_same_name_is_another_one(
 def test_a_correction_without_the_payload_of_the_log_is_refused(
     checkout: Path, tmp_path: Path
 ) -> None:
-    loaded = write(tmp_path / "loaded.mcap", demo_content(checkout, payload=DISC), ROWS)
-    renamed = load_cell(_copy(checkout, tmp_path, _replaced("name: disc", "name: cube")))
+    content = demo_content(checkout, payload=DISC)
+    loaded = write(tmp_path / "loaded.mcap", content, ROWS)
+    other_payload = _replaced("name: disc", "name: cube")
+    renamed = load_cell(_copy(checkout, tmp_path, other_payload))
     message = "payload disc on flange-a, which the given description does not have"
     with pytest.raises(LogsDiffer, match=message):
         load_run(loaded, renamed)
@@ -188,12 +208,14 @@ def test_drives_of_other_serial_numbers_are_of_another_robot(
     checkout: Path, demo: Cell, tmp_path: Path
 ) -> None:
     """The drives of this log reported the serial number 7, and its description names none."""
-    unnamed = _copy(checkout, tmp_path, lambda text: re.sub(r", serial: \d+", "", text))
+    without_serials = partial(re.sub, r", serial: \d+", "")
+    unnamed = _copy(checkout, tmp_path, without_serials)
     content = replace(demo_content(checkout), files=bundle(unnamed))
     log = write(tmp_path / "bare.mcap", content, ROWS)
-    j1, *others = load_cell(unnamed).axes
-    cell_of_7 = replace(demo, axes=(_with_identity(j1, serial=7), *others))
-    cell_of_8 = replace(demo, axes=(_with_identity(j1, serial=8), *others))
+    unnamed_cell = replace(demo, axes=load_cell(unnamed).axes)
+    j1 = unnamed_cell.axes[0]
+    cell_of_7 = _with_first_axis(unnamed_cell, _with_identity(j1, serial=7))
+    cell_of_8 = _with_first_axis(unnamed_cell, _with_identity(j1, serial=8))
 
     load_run(log, cell_of_7)
     message = "serial number 7, reported by the drive of axis J1; expected 8"
@@ -205,16 +227,29 @@ def test_drives_of_other_serial_numbers_are_of_another_robot(
 
 
 UPSIDE_DOWN = _replaced("gravity_m_s2: [0.0, 0.0, -9.81]", "gravity_m_s2: [0.0, 0.0, 9.81]")
-#: a change that is a correction, and the sections that then differ
-CORRECTIONS: dict[str, tuple[Change, tuple[str, ...]]] = {
-    "gravity": (UPSIDE_DOWN, ("robot.gravity_m_s2",)),
-    "nameplate": (
-        _replaced("nameplate_gain_nm_per_a: ", "nameplate_gain_nm_per_a: 1"),
-        ("axes.nameplate_gain (J1)",),
-    ),
-    "mass": (_replaced("mass_kg: 4.59", "mass_kg: 4.60"), ("payloads",)),
-    "filter": (_replaced("position_cutoff_hz: 40", "position_cutoff_hz: 41"), ("conditioning",)),
-    "comment": (lambda text: f"# later\n{text}", ()),
+HIGHER_GAIN = _replaced("nameplate_gain_nm_per_a: ", "nameplate_gain_nm_per_a: 1")
+HEAVIER = _replaced("mass_kg: 4.59", "mass_kg: 4.60")
+HIGHER_CUTOFF = _replaced("position_cutoff_hz: 40", "position_cutoff_hz: 41")
+
+
+def _with_comment(text: str) -> str:
+    return f"# later\n{text}"
+
+
+@dataclass(frozen=True)
+class Correction:
+    """A change that is a correction, and the sections that then differ."""
+
+    change: Change
+    sections: tuple[str, ...]
+
+
+CORRECTIONS = {
+    "gravity": Correction(UPSIDE_DOWN, ("robot.gravity_m_s2",)),
+    "nameplate": Correction(HIGHER_GAIN, ("axes.nameplate_gain (J1)",)),
+    "mass": Correction(HEAVIER, ("payloads",)),
+    "filter": Correction(HIGHER_CUTOFF, ("conditioning",)),
+    "comment": Correction(_with_comment, ()),
 }
 
 
@@ -222,13 +257,13 @@ CORRECTIONS: dict[str, tuple[Change, tuple[str, ...]]] = {
 def test_a_corrected_description_is_taken_and_recorded(
     kind: str, checkout: Path, demo: Cell, tmp_path: Path, log: Path
 ) -> None:
-    change, sections = CORRECTIONS[kind]
-    corrected = load_cell(_copy(checkout, tmp_path, change))
+    correction = CORRECTIONS[kind]
+    corrected = load_cell(_copy(checkout, tmp_path, correction.change))
     run, described = load_run(log, corrected)
     assert described is corrected
     assert run.recording is not None
-    assert run.recording.corrected == sections
-    replaced_digest = demo.digest if sections else None
+    assert run.recording.corrected == correction.sections
+    replaced_digest = demo.digest if correction.sections else None
     assert run.recording.replaced_configuration_sha256 == replaced_digest
     uncorrected, _ = load_run(log)
     assert uncorrected.recording is not None
@@ -239,12 +274,10 @@ def test_geometry_ratio_and_zero_are_corrections(demo: Cell) -> None:
     j1, *others, j6 = demo.axes
     zeroed_j1 = replace(j1, zero_offset_rad=0.1)
     zeroed_j6 = replace(j6, zero_offset_rad=0.2)
-    corrected = replace(
-        demo,
-        urdf=demo.urdf.replace("0.225", "0.2251"),
-        ratio=2.0 * demo.ratio,
-        axes=(zeroed_j1, *others, zeroed_j6),
-    )
+    urdf = demo.urdf.replace("0.225", "0.2251")
+    ratio = 2.0 * demo.ratio
+    axes = (zeroed_j1, *others, zeroed_j6)
+    corrected = replace(demo, urdf=urdf, ratio=ratio, axes=axes)
     assert corrected.urdf != demo.urdf
     assert mismatch(demo, corrected) is None
     assert differing_sections(demo, corrected) == (
@@ -260,18 +293,21 @@ def test_a_description_that_is_refused_now_can_be_corrected_by_one_of_its_name(
     files = bundle(demo_file)
     given = load_cell(demo_file)
     with_a_node_twice = files["cell.yaml"].replace(b"node_id: 3", b"node_id: 2")
-    correction = correction_of("a.mcap", {**files, "cell.yaml": with_a_node_twice}, given)
+    corrected = {**files, "cell.yaml": with_a_node_twice}
+    correction = correction_of("a.mcap", corrected, given)
     assert correction is not None
     assert correction.sections == ("cell.yaml",)
     renamed = with_a_node_twice.replace(b"name: demo", b"name: press")
+    of_press = {**files, "cell.yaml": renamed}
     with pytest.raises(LogsDiffer, match="a log of cell 'press'; expected one of cell 'demo'"):
-        correction_of("a.mcap", {**files, "cell.yaml": renamed}, given)
+        correction_of("a.mcap", of_press, given)
 
 
 def test_a_correction_is_said_once_for_logs_that_share_a_description(
     checkout: Path, tmp_path: Path, log: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    loaded = write(tmp_path / "loaded.mcap", demo_content(checkout, DISC), EQUAL_ROWS)
+    content = demo_content(checkout, DISC)
+    loaded = write(tmp_path / "loaded.mcap", content, EQUAL_ROWS)
     corrected = load_cell(_copy(checkout, tmp_path, UPSIDE_DOWN))
     loader = LogLoader.of([log, loaded], corrected)
     list(loader.runs([log, loaded], "fit"))
@@ -281,12 +317,15 @@ def test_a_correction_is_said_once_for_logs_that_share_a_description(
         "robot.gravity_m_s2"
     ]
     sources = tuple(loader.sources)
-    recordings = [source.recording for source in sources if source.recording is not None]
-    corrections = [recording.corrected for recording in recordings]
-    assert corrections == [("robot.gravity_m_s2",)] * 2
+    corrections = []
+    for source in sources:
+        assert source.recording is not None
+        corrections.append(source.recording.corrected)
+    assert corrections == [("robot.gravity_m_s2",), ("robot.gravity_m_s2",)]
     # As the calibration keeps it.
-    content = encode_calibration(replace(demo_calibration(), sources=sources))
-    decoded = decode_calibration(content, "calibration.yaml")
+    calibration = replace(demo_calibration(), sources=sources)
+    encoded = encode_calibration(calibration)
+    decoded = decode_calibration(encoded, "calibration.yaml")
     assert decoded.sources == sources
 
 
@@ -304,28 +343,61 @@ def test_logs_of_two_descriptions_are_not_weighed_by_one_model(
         weigh_logs(calibration, [log], bare=[other])
 
 
-#: a command, and the exit code that it ends with
-VERBS: dict[str, tuple[str, ExitCode]] = {
-    "fit": ("fit LOG LOG --cell CELL", ExitCode.DATA_UNFIT),
-    "fit with fixed gains": ("fit LOG --gains fixed --cell CELL", ExitCode.DATA_UNFIT),
-    "fit of cases": ("fit LOG LOG --cases out --cell CELL", ExitCode.DATA_UNFIT),
-    "residual": ("residual LOG LOG --cell CELL", ExitCode.DATA_UNFIT),
-    "validate": ("validate CALIBRATION LOG --cell CELL", ExitCode.DATA_UNFIT),
-    "weigh": ("weigh CALIBRATION LOG --cell CELL", ExitCode.DATA_UNFIT),
-    "contact": ("contact CALIBRATION LOG --cell CELL", ExitCode.DATA_UNFIT),
-    "certificate": ("certificate DEMO --cell CELL", ExitCode.CALIBRATION_REFUSED),
-    "export urdf": ("export urdf CELL DEMO --out out.urdf", ExitCode.CONFIGURATION),
-    "export mjcf": ("export mjcf CELL DEMO --out out.xml", ExitCode.CONFIGURATION),
-    "export bag": ("export bag LOG --calibration CALIBRATION --out bag", ExitCode.CONFIGURATION),
-    "monitor": ("monitor CELL --calibration DEMO --once", ExitCode.DATA_UNFIT),
-    "apply": ("apply CELL DEMO --configuration-changed", ExitCode.CALIBRATION_REFUSED),
+#: Commands by the exit code that they end with
+VERBS_BY_CODE = {
+    ExitCode.DATA_UNFIT: {
+        "fit": "fit LOG LOG --cell CELL",
+        "fit with fixed gains": "fit LOG --gains fixed --cell CELL",
+        "fit of cases": "fit LOG LOG --cases out --cell CELL",
+        "residual": "residual LOG LOG --cell CELL",
+        "validate": "validate CALIBRATION LOG --cell CELL",
+        "weigh": "weigh CALIBRATION LOG --cell CELL",
+        "contact": "contact CALIBRATION LOG --cell CELL",
+        "monitor": "monitor CELL --calibration DEMO --once",
+    },
+    ExitCode.CALIBRATION_REFUSED: {
+        "certificate": "certificate DEMO --cell CELL",
+        "apply": "apply CELL DEMO --configuration-changed",
+    },
+    ExitCode.CONFIGURATION: {
+        "export urdf": "export urdf CELL DEMO --out out.urdf",
+        "export mjcf": "export mjcf CELL DEMO --out out.xml",
+        "export bag": "export bag LOG --calibration CALIBRATION --out bag",
+    },
 }
 
 
-def _run(command: str, files: dict[str, Path]) -> int:
+@dataclass(frozen=True)
+class Command:
+    """A command with words for its files, and the exit code that it ends with."""
+
+    words: str
+    code: ExitCode
+
+
+def _commands(by_code: dict[ExitCode, dict[str, str]]) -> dict[str, Command]:
+    commands = {}
+    for code, words_of in by_code.items():
+        for verb, words in words_of.items():
+            commands[verb] = Command(words, code)
+    return commands
+
+
+VERBS = _commands(VERBS_BY_CODE)
+
+
+def _run(command: Command, files: dict[str, Path]) -> int:
     """Run a command, with the path of each file for its word."""
-    arguments = [str(files.get(word, word)) for word in command.split()]
+    arguments = []
+    for word in command.words.split():
+        argument = files.get(word, word)
+        arguments.append(str(argument))
     return main(arguments)
+
+
+def _one_line(text: str) -> str:
+    """A printed text without its line breaks."""
+    return " ".join(text.split())
 
 
 @pytest.mark.parametrize("verb", VERBS)
@@ -341,51 +413,52 @@ def test_every_verb_refuses_the_description_of_another_robot(
     a calibration of each.
     """
     monkeypatch.chdir(tmp_path)
-    change, _ = OTHERS["another name"]
     press_calibration = tmp_path / "press-calibration.yaml"
     save_calibration(_calibration("press"), press_calibration)
     demo_calibration_file = tmp_path / "demo-calibration.yaml"
     save_calibration(_calibration("demo"), demo_calibration_file)
     files = {
         "LOG": log,
-        "CELL": _copy(checkout, tmp_path, change),
+        "CELL": _copy(checkout, tmp_path, ANOTHER_NAME.change),
         "CALIBRATION": press_calibration,
         "DEMO": demo_calibration_file,
     }
-    command, code = VERBS[verb]
-    assert _run(command, files) == code
-    error_output = " ".join(capsys.readouterr().err.split())
+    command = VERBS[verb]
+    assert _run(command, files) == command.code
+    error_output = _one_line(capsys.readouterr().err)
     assert "'demo'" in error_output
     assert "'press'" in error_output
 
 
-#: a change that makes it another robot of the same name, and the difference that is named
-SAME_NAME: dict[str, tuple[Change, str]] = {
-    "drive": (
-        lambda text: text.replace("product_code: 0x00040200", "product_code: 0x00040300"),
-        "drive of J1 with product code",
-    ),
-    "node": (_replaced("node_id: 3", "node_id: 33"), "drive of J3 with node id"),
+ANOTHER_PRODUCT = OtherCell(
+    lambda text: text.replace("product_code: 0x00040200", "product_code: 0x00040300"),
+    "drive of J1 with product code",
+)
+NODE_33 = OtherCell(_replaced("node_id: 3", "node_id: 33"), "drive of J3 with node id")
+#: Another robot of the same name, and the difference that is named
+SAME_NAME = {"drive": ANOTHER_PRODUCT, "node": NODE_33}
+OF_ANOTHER_ROBOT_BY_CODE = {
+    ExitCode.DATA_UNFIT: {
+        "validate": "validate CALIBRATION LOG",
+        "export csv": "export csv CALIBRATION LOG --out out.csv",
+        "console": "console CELL --calibration CALIBRATION",
+        "weigh": "weigh CALIBRATION LOG",
+        "contact": "contact CALIBRATION LOG",
+        "monitor": "monitor CELL --calibration CALIBRATION --once",
+        "history": "history CELL --add CALIBRATION",
+    },
+    ExitCode.CALIBRATION_REFUSED: {
+        "certificate": "certificate CALIBRATION --cell CELL",
+        "beside": "certificate OWN --beside CALIBRATION --cell CELL",
+        "apply": "apply CELL CALIBRATION --configuration-changed",
+    },
+    ExitCode.CONFIGURATION: {
+        "export urdf": "export urdf CELL CALIBRATION --out out.urdf",
+        "export mjcf": "export mjcf CELL CALIBRATION --out out.xml",
+        "export bag": "export bag LOG --calibration CALIBRATION --out bag",
+    },
 }
-#: a command, and the exit code that it ends with
-OF_ANOTHER_ROBOT: dict[str, tuple[str, ExitCode]] = {
-    "validate": ("validate CALIBRATION LOG", ExitCode.DATA_UNFIT),
-    "export csv": ("export csv CALIBRATION LOG --out out.csv", ExitCode.DATA_UNFIT),
-    "console": ("console CELL --calibration CALIBRATION", ExitCode.DATA_UNFIT),
-    "weigh": ("weigh CALIBRATION LOG", ExitCode.DATA_UNFIT),
-    "contact": ("contact CALIBRATION LOG", ExitCode.DATA_UNFIT),
-    "certificate": ("certificate CALIBRATION --cell CELL", ExitCode.CALIBRATION_REFUSED),
-    "beside": (
-        "certificate OWN --beside CALIBRATION --cell CELL",
-        ExitCode.CALIBRATION_REFUSED,
-    ),
-    "export urdf": ("export urdf CELL CALIBRATION --out out.urdf", ExitCode.CONFIGURATION),
-    "export mjcf": ("export mjcf CELL CALIBRATION --out out.xml", ExitCode.CONFIGURATION),
-    "export bag": ("export bag LOG --calibration CALIBRATION --out bag", ExitCode.CONFIGURATION),
-    "monitor": ("monitor CELL --calibration CALIBRATION --once", ExitCode.DATA_UNFIT),
-    "apply": ("apply CELL CALIBRATION --configuration-changed", ExitCode.CALIBRATION_REFUSED),
-    "history": ("history CELL --add CALIBRATION", ExitCode.DATA_UNFIT),
-}
+OF_ANOTHER_ROBOT = _commands(OF_ANOTHER_ROBOT_BY_CODE)
 
 
 @pytest.mark.parametrize("different", SAME_NAME)
@@ -401,8 +474,8 @@ def test_every_verb_refuses_a_calibration_of_another_robot_with_the_same_name(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    change, difference = SAME_NAME[different]
-    other = load_cell(_copy(checkout, tmp_path, change, "other.yaml"))
+    case = SAME_NAME[different]
+    other = load_cell(_copy(checkout, tmp_path, case.change, "other.yaml"))
     other_calibration = tmp_path / "other-calibration.yaml"
     save_calibration(_calibration_of(other), other_calibration)
     own_calibration = tmp_path / "own-calibration.yaml"
@@ -413,13 +486,13 @@ def test_every_verb_refuses_a_calibration_of_another_robot_with_the_same_name(
         "CALIBRATION": other_calibration,
         "OWN": own_calibration,
     }
-    command, code = OF_ANOTHER_ROBOT[verb]
-    assert _run(command, files) == code
+    command = OF_ANOTHER_ROBOT[verb]
+    assert _run(command, files) == command.code
     captured = capsys.readouterr()
-    output = " ".join((captured.out + captured.err).split())
+    output = _one_line(captured.out + captured.err)
     assert "another robot with the cell name 'demo'" in output
     # The number is left out: on the page of `beside`, the calibration is the own one.
-    assert difference in output
+    assert case.message in output
 
 
 def test_a_calibration_names_the_joint_in_which_its_robot_differs(demo: Cell) -> None:
@@ -439,7 +512,8 @@ def test_what_a_description_corrects_or_leaves_open_makes_no_other_robot(demo: C
     exchanged = _with_first_axis(demo, _with_identity(j1, serial=99))
     unnamed = _with_first_axis(demo, replace(j1, identity=None))
     zeroed = _with_first_axis(demo, replace(j1, zero_offset_rad=0.1))
-    lengthened = replace(demo, urdf=demo.urdf.replace("0.225", "0.2251"))
+    longer_urdf = demo.urdf.replace("0.225", "0.2251")
+    lengthened = replace(demo, urdf=longer_urdf)
     for cell in (exchanged, unnamed, zeroed, lengthened):
         assert mismatch_of_calibration(calibration, cell) is None
     # Files of earlier versions do not name their robot.
@@ -461,15 +535,17 @@ def _with_another_vendor(cell: Cell) -> Cell:
 
 def _with_another_parent(cell: Cell) -> Cell:
     """The last joint on the base, beside the arm."""
-    parents = list(re.finditer(r'<parent link="([^"]+)"', cell.urdf))
-    root = parents[0][1]
-    last = parents[-1]
-    urdf = cell.urdf[: last.start(1)] + root + cell.urdf[last.end(1) :]
-    return replace(cell, urdf=urdf)
+    first, *_, last = re.finditer(r'<parent link="([^"]+)"', cell.urdf)
+    before = cell.urdf[: last.start(1)]
+    after = cell.urdf[last.end(1) :]
+    root = first[1]
+    return replace(cell, urdf=before + root + after)
 
 
 def _plan_of(cell: Cell) -> Plan:
-    move = PlannedMove((0.0,) * 6, velocity=0.1, acceleration=0.1, dwell_s=0.1)
+    home = (0.0,) * 6
+    move = PlannedMove(home, velocity=0.1, acceleration=0.1, dwell_s=0.1)
+    units = tuple(axis.unit for axis in cell.axes)
     return Plan(
         cell="demo",
         seed=1,
@@ -477,7 +553,7 @@ def _plan_of(cell: Cell) -> Plan:
         predicted_std_percent=(),
         duration_s=1.0,
         moves=(move,),
-        units=tuple(axis.unit for axis in cell.axes),
+        units=units,
         robot=calibrated_robot(cell),
     )
 
@@ -487,7 +563,8 @@ def _refused_documents(made_with: Cell, used_with: Cell, plan_file: Path) -> lis
     refused = []
     if mismatch(made_with, used_with) is not None:
         refused.append("log")
-    if mismatch_of_calibration(_calibration_of(made_with), used_with) is not None:
+    calibration = _calibration_of(made_with)
+    if mismatch_of_calibration(calibration, used_with) is not None:
         refused.append("calibration")
     plan = _plan_of(made_with)
     save_plan(plan, plan_file)
@@ -531,8 +608,10 @@ def test_a_robot_with_fewer_axes_is_named_by_its_axes(demo: Cell) -> None:
 def test_a_calibration_keeps_the_robot_that_it_is_of(demo: Cell) -> None:
     robot = calibrated_robot(demo)
     content = encode_calibration(_calibration_of(demo))
-    assert decode_calibration(content, "calibration.yaml").robot == robot
-    assert f"robot:\n  kinematics_sha256: {robot.kinematics_sha256}".encode() in content
+    decoded = decode_calibration(content, "calibration.yaml")
+    assert decoded.robot == robot
+    section = f"robot:\n  kinematics_sha256: {robot.kinematics_sha256}"
+    assert section.encode() in content
 
 
 def test_the_axes_whose_zeros_differ_are_found_among_the_sections(

@@ -20,6 +20,7 @@ from typing import Any
 import pytest
 
 from daq.cli.terminal import interruptible
+from daq.config.cell import Bus
 from daq.config.recalibration import Command, Interlock
 from daq.config.same_cell import calibrated_robot
 from daq.documents.session_state import Outcome
@@ -36,7 +37,7 @@ from daq.errors import (
     exit_code,
 )
 from daq.jobs.context import section_of
-from daq.jobs.job import preview, time_bound
+from daq.jobs.job import Preview, preview, time_bound
 from daq.jobs.journal import Form, Journal
 from daq.ledger.audit import AuditAction, append
 from daq.ledger.fold import figures_of
@@ -68,15 +69,21 @@ def held(rig: Rig, kind: type[Exception], code: int) -> Exception:
     return caught.value
 
 
+def without_drives(rig: Rig) -> list[str]:
+    """Replace the tool that looks at the drives; the list says that it was called."""
+    calls: list[str] = []
+    rig.tools = replace(rig.tools, drives=lambda *_: calls.append("drives"))
+    return calls
+
+
 @pytest.mark.slow
 def test_an_interlock_that_says_no_lets_nothing_begin(tmp_path: Path, made: Made) -> None:
     folder = tmp_path / "cell"
     rig = made_rig(folder, made)
     rig.closed.unlink()
-    asked = []
-    rig.tools = replace(rig.tools, drives=lambda *_: asked.append("drives"))
+    calls = without_drives(rig)
     held(rig, NotReleased, ExitCode.NOT_RELEASED)
-    assert asked == []
+    assert calls == []
     assert not (rig.cells / "mounted").exists()
     # The door is closed: the next job takes the session up.
     rig.closed.touch()
@@ -90,40 +97,37 @@ def test_a_cell_that_was_renamed_or_has_the_history_of_another_robot_is_held(
     """Nothing has moved, and the message says the name, or the drive."""
     folder = tmp_path / "cell"
     rig = made_rig(folder, made)
-    asked = []
-    rig.tools = replace(rig.tools, drives=lambda *_: asked.append("drives"))
+    calls = without_drives(rig)
     robot = calibrated_robot(rig.cell)
     ledger = Ledger.of(rig.cell)
     assert ledger is not None
-    changed_drive = replace(robot.drives[0], product_code=1)
-    drives = (changed_drive, *robot.drives[1:])
-    other = replace(calibration_of(0), robot=replace(robot, drives=drives))
-    details = {
-        "sha256": digest_of(other),
+    first_drive, *other_drives = robot.drives
+    changed_drive = replace(first_drive, product_code=1)
+    other_robot = replace(robot, drives=(changed_drive, *other_drives))
+    other = replace(calibration_of(0), robot=other_robot)
+    sha256 = digest_of(other)
+    entered = {
+        "sha256": sha256,
         "cell": "demo",
         "entered": BEGAN.isoformat(),
-        "figures": figures_of(other, digest_of(other), BEGAN),
-        "robot": asdict(other.robot) if other.robot is not None else None,
+        "figures": figures_of(other, sha256, BEGAN),
+        "robot": asdict(other_robot),
     }
-    entered = AuditAction.CALIBRATION_ENTERED
-    append(ledger.audit, entered, at=BEGAN, who="anna", subject="history of demo", details=details)
+
+    def append_entry(action: AuditAction, subject: str, details: dict[str, Any]) -> None:
+        append(ledger.audit, action, at=BEGAN, who="anna", subject=subject, details=details)
+
+    append_entry(AuditAction.CALIBRATION_ENTERED, "history of demo", entered)
     error = held(rig, JobHeld, ExitCode.JOB_HELD)
     assert (
         "another robot with the cell name 'demo': found drive of J1 with product code 0x1;"
     ) in str(error)
     renamed = {"old_name": "demo", "cell": "press", "robot": asdict(robot)}
-    append(
-        ledger.audit,
-        AuditAction.RENAMED,
-        at=BEGAN,
-        who="anna",
-        subject="cell press",
-        details=renamed,
-    )
+    append_entry(AuditAction.RENAMED, "cell press", renamed)
     error = held(rig, JobHeld, ExitCode.JOB_HELD)
     assert "a robot that was renamed to 'press'" in str(error)
     assert "if it is another robot, give it another name, or another audit log" in str(error)
-    assert asked == []
+    assert calls == []
 
 
 @pytest.mark.slow
@@ -217,7 +221,8 @@ def test_a_payload_that_cannot_be_mounted_ends_the_job_and_the_next_goes_on_with
 def test_two_jobs_at_once_are_one(tmp_path: Path, made: Made) -> None:
     folder = tmp_path / "cell"
     rig = made_rig(folder, made)
-    with bus_lock(rig.cell, rig.folder), pytest.raises(BusTaken, match="one at a time"):
+    taken = bus_lock(rig.cell, rig.folder)
+    with taken, pytest.raises(BusTaken, match="one at a time"):
         rig.job()
     assert rig.sessions == ()
     assert exit_code(BusTaken) == ExitCode.BUS_TAKEN
@@ -229,11 +234,9 @@ def test_the_lock_of_a_bus_ends_with_its_process(tmp_path: Path, made: Made) -> 
     """A bus across processes; the other one is killed."""
     folder = tmp_path / "cell"
     rig = made_rig(folder, made)
-    buses = tuple(replace(bus, interface="socketcan", channel="vcan9") for bus in rig.cell.buses)
-    shared = replace(
-        rig.cell,
-        buses=buses,
-    )
+    (bus,) = rig.cell.buses
+    shared_bus = replace(bus, interface="socketcan", channel="vcan9")
+    shared = replace(rig.cell, buses=(shared_bus,))
     read_end, signal_end = os.pipe()
     child = os.fork()
     if child == 0:
@@ -273,10 +276,28 @@ def test_a_lock_that_is_no_file_is_refused_at_once(tmp_path: Path, made: Made) -
     folder = tmp_path / "cell"
     rig = made_rig(folder, made)
     (bus,) = rig.cell.buses
-    os.mkfifo(rig.folder / lock_name(bus))
-    with pytest.raises(OutputFailed, match="no regular file"), bus_lock(rig.cell, rig.folder):
+    path = rig.folder / lock_name(bus)
+    os.mkfifo(path)
+    lock = bus_lock(rig.cell, rig.folder)
+    with pytest.raises(OutputFailed, match="no regular file"), lock:
         pass
-    assert (rig.folder / lock_name(bus)).is_fifo()
+    assert path.is_fifo()
+
+
+AddressInfo = tuple[Any, ...]
+
+
+def address_info(address: str, port: int) -> AddressInfo:
+    """An answer of getaddrinfo."""
+    family = socket.AF_INET
+    if ":" in address:
+        family = socket.AF_INET6
+    return (family, 1, 6, "", (address, port))
+
+
+def hub_bus(bus: Bus, host: str) -> Bus:
+    """A bus behind a hub."""
+    return replace(bus, interface="socketcand", channel="can0", host=host, port=29536)
 
 
 def test_a_hub_has_one_lock_whatever_it_is_called(
@@ -288,25 +309,32 @@ def test_a_hub_has_one_lock_whatever_it_is_called(
         "hub": ["fd00::7", "10.0.0.9", "10.0.0.7"],
         "hub.lan": ["10.0.0.7", "10.0.0.9"],
         "other": ["10.0.0.8"],
+        "localhost": ["::1", "127.0.0.1"],
+        "127.0.0.1": ["127.0.0.1"],
+        "::1": ["::1"],
     }
-    known |= {"localhost": ["::1", "127.0.0.1"], "127.0.0.1": ["127.0.0.1"], "::1": ["::1"]}
 
-    def addresses(host: str, port: int, **_: object) -> list[tuple[Any, ...]]:
+    def addresses(host: str, port: int, **_: object) -> list[AddressInfo]:
         if host not in known:
             raise socket.gaierror(-2, "Name or service not known")
-        kinds = [socket.AF_INET6 if ":" in one else socket.AF_INET for one in known[host]]
-        return [(kind, 1, 6, "", (one, port)) for kind, one in zip(kinds, known[host], strict=True)]
+        return [address_info(address, port) for address in known[host]]
 
     monkeypatch.setattr(socket, "getaddrinfo", addresses)
 
     def name(host: str) -> str:
-        changed_bus = replace(bus, interface="socketcand", channel="can0", host=host, port=29536)
-        return lock_name(changed_bus)
+        return lock_name(hub_bus(bus, host))
 
-    assert name("hub") == name("hub.lan") == "drivegain-socketcand-can0-10.0.0.7-29536.lock"
-    assert name("localhost") == name("127.0.0.1") == name("::1") != name("hub")
-    assert name("other") != name("hub")
-    assert name("Nowhere") == name("nowhere") == "drivegain-socketcand-can0-nowhere-29536.lock"
+    hub = "drivegain-socketcand-can0-10.0.0.7-29536.lock"
+    nowhere = "drivegain-socketcand-can0-nowhere-29536.lock"
+    this_machine = name("localhost")
+    assert name("hub") == hub
+    assert name("hub.lan") == hub
+    assert name("127.0.0.1") == this_machine
+    assert name("::1") == this_machine
+    assert this_machine != hub
+    assert name("other") != hub
+    assert name("Nowhere") == nowhere
+    assert name("nowhere") == nowhere
 
 
 @pytest.mark.parametrize(
@@ -325,12 +353,9 @@ def test_a_hub_has_one_lock_whatever_it_is_called(
 def test_this_machine_is_one_hub_by_all_its_names(host: str, tmp_path: Path, made: Made) -> None:
     folder = tmp_path / "cell"
     (bus,) = made_rig(folder, made).cell.buses
-    hub = replace(bus, interface="socketcand", channel="can0", host=host, port=29536)
-    assert (
-        lock_name(hub)
-        == lock_name(replace(hub, host="localhost"))
-        == "drivegain-socketcand-can0-localhost-29536.lock"
-    )
+    name = "drivegain-socketcand-can0-localhost-29536.lock"
+    assert lock_name(hub_bus(bus, host)) == name
+    assert lock_name(hub_bus(bus, "localhost")) == name
 
 
 @pytest.mark.parametrize(
@@ -342,11 +367,9 @@ def test_an_address_of_a_hub_may_be_spelt_in_several_ways(
 ) -> None:
     folder = tmp_path / "cell"
     (bus,) = made_rig(folder, made).cell.buses
-    names = [
-        lock_name(replace(bus, interface="socketcand", channel="can0", host=host, port=29536))
-        for host in (one, other, "10.0.0.8")
-    ]
-    assert names[0] == names[1] != names[2]
+    name = lock_name(hub_bus(bus, one))
+    assert lock_name(hub_bus(bus, other)) == name
+    assert lock_name(hub_bus(bus, "10.0.0.8")) != name
 
 
 def test_a_hub_known_by_a_mapped_address_alone_is_that_of_its_ipv4_address(
@@ -359,15 +382,13 @@ def test_a_hub_known_by_a_mapped_address_alone_is_that_of_its_ipv4_address(
     (bus,) = made_rig(folder, made).cell.buses
     known = {"hub": ["2001:db8::1", "::ffff:10.0.0.7"], "10.0.0.7": ["10.0.0.7"]}
 
-    def addresses(host: str, port: int, **_: object) -> list[tuple[Any, ...]]:
-        return [
-            (socket.AF_INET6 if ":" in one else socket.AF_INET, 1, 6, "", (one, port))
-            for one in known[host]
-        ]
+    def addresses(host: str, port: int, **_: object) -> list[AddressInfo]:
+        return [address_info(address, port) for address in known[host]]
 
     monkeypatch.setattr(socket, "getaddrinfo", addresses)
-    hub = replace(bus, interface="socketcand", channel="can0", host="hub", port=29536)
-    assert lock_name(hub) == lock_name(replace(hub, host="10.0.0.7"))
+    by_name = lock_name(hub_bus(bus, "hub"))
+    by_address = lock_name(hub_bus(bus, "10.0.0.7"))
+    assert by_name == by_address
 
 
 @pytest.mark.slow
@@ -380,7 +401,8 @@ def test_a_job_that_is_out_of_time_stops_the_axes(tmp_path: Path, one_move: Path
         def room(_folder: Path) -> int:
             # Asked ten times a second of recorded time: in the middle of the first move the bound
             # is reached.
-            if any(node.drive.state is PowerState.OPERATION_ENABLED for node in cell.nodes):
+            states = [node.drive.state for node in cell.nodes]
+            if PowerState.OPERATION_ENABLED in states:
                 powered.append(True)
                 if len(powered) == 3:
                     signal.raise_signal(signal.SIGALRM)
@@ -453,10 +475,8 @@ def test_a_job_that_is_ended_while_a_good_run_closes_moves_no_more(
 
     monkeypatch.setattr(CanopenNetwork, "_restore", ended_meanwhile)
     with serving(rig) as cell:
-        with (
-            interruptible(moves_again=True) as block_signals,
-            pytest.raises(KeyboardInterrupt) as interrupt,
-        ):
+        unblocked = interruptible(moves_again=True)
+        with unblocked as block_signals, pytest.raises(KeyboardInterrupt) as interrupt:
             rig.job(block_signals=block_signals)
         assert powerless(cell)
     assert not hasattr(interrupt.value, "__notes__")
@@ -469,11 +489,13 @@ def test_a_disk_that_is_full_is_reported_before_and_during_a_run(
 ) -> None:
     folder = tmp_path / "cell"
     rig = make_rig(folder, one_move, min_free_mb=1000)
-    rig.tools = replace(rig.tools, free=lambda _: 999 * 10**6)
+    too_little = 999 * 10**6
+    rig.tools = replace(rig.tools, free=lambda _: too_little)
     error = held(rig, DiskSpaceShort, ExitCode.UNEXPECTED)
     assert "min_free_mb" in str(error)
-    rooms = iter((10**12, 10**12, 10**12, 10**12))
-    rig.tools = replace(rig.tools, free=lambda _: next(rooms, 10**6))
+    rooms = iter([10**12] * 4)
+    full = 10**6
+    rig.tools = replace(rig.tools, free=lambda _: next(rooms, full))
     with serving(rig) as cell:
         held(rig, DiskSpaceShort, ExitCode.UNEXPECTED)
         assert powerless(cell)
@@ -484,16 +506,15 @@ def test_a_disk_that_is_full_is_reported_before_and_during_a_run(
 # jobs must be what would harm, and a robot that is calibrated once more by its own policy is not
 # harmed.
 
-ANY_AGE = {"motion": "allowed", "apply": {"by": "job", "max_std_percent": 8, "max_age_days": None}}
+BY_JOB_AT_ANY_AGE = {"by": "job", "max_std_percent": 8, "max_age_days": None}
+ANY_AGE = {"motion": "allowed", "apply": BY_JOB_AT_ANY_AGE}
 
 
 def not_counted(rig: Rig) -> list[str]:
     """Folders that the journal names as sessions from the future."""
-    return [
-        event["folder"]
-        for event in rig.events
-        if event["event"] == "a session from the future does not count"
-    ]
+    name = "a session from the future does not count"
+    events = [event for event in rig.events if event["event"] == name]
+    return [event["folder"] for event in events]
 
 
 @pytest.mark.slow
@@ -627,13 +648,18 @@ def test_two_weighings_agree_as_they_do_everywhere(tmp_path: Path, made: Made) -
     cell = made_rig(folder, made).cell
     section = cell.recalibration
     assert section is not None
-    runs = tuple(replace(run, mass_kg=None if run.payload is None else 0.4) for run in section.runs)
-    payloads = tuple(
-        replace(payload, mass_kg=0.3, mass_tolerance_kg=0.1) for payload in cell.payloads
-    )
-    recalibration = replace(section, runs=runs)
-    weighed = replace(cell, payloads=payloads, recalibration=recalibration)
-    assert section_of(weighed).runs == runs
+    runs = []
+    for run in section.runs:
+        mass_kg = None
+        if run.payload is not None:
+            mass_kg = 0.4
+        runs.append(replace(run, mass_kg=mass_kg))
+    payloads = []
+    for payload in cell.payloads:
+        payloads.append(replace(payload, mass_kg=0.3, mass_tolerance_kg=0.1))
+    recalibration = replace(section, runs=tuple(runs))
+    weighed = replace(cell, payloads=tuple(payloads), recalibration=recalibration)
+    assert section_of(weighed).runs == tuple(runs)
 
 
 @pytest.mark.parametrize(
@@ -654,18 +680,26 @@ def test_a_run_whose_payload_is_not_the_cells_is_refused(
     assert rig.sessions == ()
 
 
+def set_age_of_began(path: Path) -> None:
+    """Let a file be as old as the beginning of the job."""
+    began_s = BEGAN.timestamp()
+    os.utime(path, (began_s, began_s))
+
+
 def test_an_interlock_is_asked_in_so_many_words(tmp_path: Path) -> None:
     path = tmp_path / "interlock"
-    interlock = Interlock(command=("some", "program"), timeout_s=1.0, file=path, max_age_s=5.0)
+    program = ("some", "program")
+    interlock = Interlock(command=program, timeout_s=1.0, file=path, max_age_s=5.0)
 
     def ask(code: int | None = 0, later_s: float = 0.0) -> None:
         now = BEGAN + timedelta(seconds=later_s)
-        require_release(interlock, lambda *_: Finished(code, "said"), lambda: now, tmp_path)
+        finished = Finished(code, "said")
+        require_release(interlock, lambda *_: finished, lambda: now, tmp_path)
 
     with pytest.raises(NotReleased, match="no such file"):
         ask()
     path.write_text("closed\nand more\n")
-    os.utime(path, (BEGAN.timestamp(), BEGAN.timestamp()))
+    set_age_of_began(path)
     for later_s in (-5.0, 0.0, 4.9):
         ask(later_s=later_s)
     for later_s in (-6.0, 6.0, 3600.0):
@@ -676,7 +710,7 @@ def test_an_interlock_is_asked_in_so_many_words(tmp_path: Path) -> None:
             ask(code)
     for text in ("open\n", "", "closed?\n"):
         path.write_text(text)
-        os.utime(path, (BEGAN.timestamp(), BEGAN.timestamp()))
+        set_age_of_began(path)
         with pytest.raises(NotReleased, match="in its first line"):
             ask()
 
@@ -687,7 +721,7 @@ def test_an_interlock_file_is_as_old_as_it_is_behind_the_command(tmp_path: Path)
     """
     path = tmp_path / "interlock"
     path.write_text("closed\n")
-    os.utime(path, (BEGAN.timestamp(), BEGAN.timestamp()))
+    set_age_of_began(path)
     at = [BEGAN]
 
     def slow(*_: object) -> Finished:
@@ -700,8 +734,9 @@ def test_an_interlock_file_is_as_old_as_it_is_behind_the_command(tmp_path: Path)
 
 
 def test_an_interlock_that_is_no_file_says_no_at_once(tmp_path: Path) -> None:
-    os.mkfifo(tmp_path / "fifo")
-    for path in (tmp_path / "fifo", tmp_path, Path(os.devnull)):
+    fifo = tmp_path / "fifo"
+    os.mkfifo(fifo)
+    for path in (fifo, tmp_path, Path(os.devnull)):
         interlock = Interlock(file=path, max_age_s=5.0)
         with pytest.raises(NotReleased, match=r"no regular file|is a directory"):
             require_release(interlock, run_command, lambda: BEGAN, tmp_path)
@@ -723,27 +758,30 @@ def test_a_program_that_says_much_is_heard_to_its_end_and_not_kept(tmp_path: Pat
     assert ended.said.endswith("0\nthe end")
     assert len(ended.said) == MAX_OUTPUT_CHARACTERS
     assert peak < 1_000_000
-    endless = run_command(Command(("yes",), 0.2), (), tmp_path)
-    assert endless == Finished(None, "not ended within 0.2 s")
-    silent = run_command(Command(("sh", "-c", "exec >&- 2>&-; sleep 60"), 0.2), (), tmp_path)
-    assert silent == Finished(None, "not ended within 0.2 s")
+    not_ended = Finished(None, "not ended within 0.2 s")
+    endless = Command(("yes",), 0.2)
+    assert run_command(endless, (), tmp_path) == not_ended
+    silent = Command(("sh", "-c", "exec >&- 2>&-; sleep 60"), 0.2)
+    assert run_command(silent, (), tmp_path) == not_ended
 
 
 def test_a_command_says_how_it_ended_and_leaves_nothing_behind(tmp_path: Path) -> None:
     command = Command(("sh", "-c", 'echo "$1" in "$(pwd)"; exit 3', "x"), 10.0)
     ended = run_command(command, ("disc",), tmp_path)
     assert ended.code == 3
-    expected = f"disc in {tmp_path.resolve()}"
-    assert ended.said == expected
-    code = run_command(Command(("no such program",), 10.0), (), tmp_path).code
+    assert ended.said == f"disc in {tmp_path.resolve()}"
+    missing = Command(("no such program",), 10.0)
+    code = run_command(missing, (), tmp_path).code
     assert code is None
-    slow = run_command(Command(("sh", "-c", "sleep 60 & echo $! > pid; wait"), 0.2), (), tmp_path)
+    with_child = Command(("sh", "-c", "sleep 60 & echo $! > pid; wait"), 0.2)
+    slow = run_command(with_child, (), tmp_path)
     assert slow == Finished(None, "not ended within 0.2 s")
     with suppress(ProcessLookupError):  # which has gone already
         text = (tmp_path / "pid").read_text()
         started = os.pidfd_open(int(text))
-        ended_within_s = 30.0
-        assert select.select([started], [], [], ended_within_s)[0] == [started]
+        longest_s = 30.0
+        ended_processes, _, _ = select.select([started], [], [], longest_s)
+        assert ended_processes == [started]
         os.close(started)
 
 
@@ -752,9 +790,13 @@ def test_a_dry_run_asks_and_writes_nothing(tmp_path: Path, made: Made) -> None:
     rig = made_rig(folder, made, warm_up_min=5)
     before = sorted(rig.folder.rglob("*"))
     journal = Journal(rig.said, Form.JSON, lambda: rig.clock.at)
-    seen = preview(
-        rig.cell_file, rig.cell, rig.tools, journal, who="a person", lock_folder=rig.folder
-    )
+
+    def dry_run() -> Preview:
+        return preview(
+            rig.cell_file, rig.cell, rig.tools, journal, who="a person", lock_folder=rig.folder
+        )
+
+    seen = dry_run()
     assert "a new session" in seen.remark
     assert seen.steps[0] == "warm up for 5 min"
     assert "mount disc, record loaded-1" in seen.steps
@@ -762,7 +804,7 @@ def test_a_dry_run_asks_and_writes_nothing(tmp_path: Path, made: Made) -> None:
     assert sorted(files) == before
     rig.closed.unlink()
     with pytest.raises(NotReleased):
-        preview(rig.cell_file, rig.cell, rig.tools, journal, who="a person", lock_folder=rig.folder)
+        dry_run()
 
 
 @pytest.mark.slow
@@ -796,7 +838,11 @@ def test_a_warm_up_is_made_of_the_plans_moves_and_asks_the_interlock_too(
     expected = ["warm-up"] * 3 + ["bare-1", "loaded-1", "held-out"]
     assert made_of == expected
     # Preflight; then before each recording, and again before its motion.
-    assert asked == ["test", "sh", *["test"] * 8, "sh", *["test"] * 2, "sh", *["test"] * 2]
+    preflight = ["test"]
+    bare = ["sh", *["test"] * 8]
+    loaded = ["sh", "test", "test"]
+    held_out = ["sh", "test", "test"]
+    assert asked == preflight + bare + loaded + held_out
     files = rig.session.folder.glob("warm-up*")
     assert not list(files)
 

@@ -41,35 +41,57 @@ from daq.log.table import Table
 from tests.daq.command_line import run_verb
 from tests.daq.logs import damaged
 
-JOINTS = tuple(f"J{number}" for number in range(1, 7))
+JOINTS = ("J1", "J2", "J3", "J4", "J5", "J6")
 START_NS = 1_700_000_000_123_456_789
 STEP_NS = 4_000_000
 ROWS = 200
-POSITION = 0.35 * np.sin(np.arange(ROWS)[:, None] / 9.0 + np.arange(6))
-EFFORT = np.cos(np.arange(ROWS)[:, None] / 7.0 + np.arange(6))
+_ROW = np.arange(ROWS)[:, None]
+_JOINT = np.arange(6)
+POSITION = 0.35 * np.sin(_ROW / 9.0 + _JOINT)
+EFFORT = np.cos(_ROW / 7.0 + _JOINT)
+VALUES = np.hstack((POSITION, EFFORT))
+TIME_S = np.arange(ROWS) * 4e-3
 TIME = TimeColumn(file="run.mcap", column=STAMP, unit=TimeUnit.NANOSECOND)
 POSITION_COLUMNS = tuple(f"position.{joint}" for joint in JOINTS)
 EFFORT_COLUMNS = tuple(f"effort.{joint}" for joint in JOINTS)
 COLUMNS = POSITION_COLUMNS + EFFORT_COLUMNS
 
+Message = tuple[str, dict[str, Any]]
+"""A topic, and the content of a message on it."""
+
+
+def stamped_header(stamp_ns: int, frame: str = "base") -> dict[str, Any]:
+    """The header of a message."""
+    seconds, nanoseconds = divmod(stamp_ns, 10**9)
+    stamp = {"sec": seconds, "nanosec": nanoseconds}
+    return {"stamp": stamp, "frame_id": frame}
+
+
+def row_ns(row: int) -> int:
+    """Stamp of a row of the recording."""
+    return START_NS + row * STEP_NS
+
 
 def message(row: int, joints: Sequence[int] = range(6), **changes: Any) -> dict[str, Any]:
     """A joint state of some joints in a row of the recording, with some fields replaced."""
-    seconds, nanoseconds = divmod(START_NS + row * STEP_NS, 10**9)
     positions = [float(POSITION[row, joint]) for joint in joints]
     efforts = [float(EFFORT[row, joint]) for joint in joints]
-    header = {"stamp": {"sec": seconds, "nanosec": nanoseconds}, "frame_id": "base"}
-    return {
-        "header": header,
+    content: dict[str, Any] = {
+        "header": stamped_header(row_ns(row)),
         "name": [JOINTS[joint] for joint in joints],
         "position": positions,
         "velocity": [],
         "effort": efforts,
-        **changes,
     }
+    return content | changes
 
 
-def write_bag(path: Path, messages: Iterable[tuple[str, dict[str, Any]]], **options: Any) -> Path:
+def joint_states(contents: Iterable[dict[str, Any]]) -> list[Message]:
+    """Messages on the usual topic."""
+    return [("/joint_states", content) for content in contents]
+
+
+def write_bag(path: Path, messages: Iterable[Message], **options: Any) -> Path:
     """A bag with these joint states, by topic, each recorded half a millisecond after the one
     before.
     """
@@ -83,9 +105,8 @@ def write_bag(path: Path, messages: Iterable[tuple[str, dict[str, Any]]], **opti
 
 def describe(topic: str | None = None, **changes: Any) -> ImportDescription:
     """A description, with what the reader needs of it alone."""
-    return ImportDescription.model_construct(
-        **{"topic": topic, "position": None, "current": None} | changes
-    )
+    needed = {"topic": topic, "position": None, "current": None}
+    return ImportDescription.model_construct(**needed | changes)
 
 
 def read(
@@ -95,34 +116,34 @@ def read(
     return read_bag(path, describe(topic, **changes), columns, TIME)
 
 
-def whole() -> list[tuple[str, dict[str, Any]]]:
+def recording() -> list[Message]:
     """The recording, all joints in each message."""
-    return [("/joint_states", message(row)) for row in range(ROWS)]
+    return joint_states(message(row) for row in range(ROWS))
 
 
 def assert_whole(table: Table) -> None:
     """The table is the recording, to the last bit."""
-    expected = np.hstack((POSITION, EFFORT))
-    np.testing.assert_array_equal(table.values, expected)
+    np.testing.assert_array_equal(table.values, VALUES)
     assert table.stamps is not None
     assert table.stamps.first_ns == START_NS
-    np.testing.assert_allclose(table.stamps.time_s, np.arange(ROWS) * 4e-3, atol=1e-12)
+    np.testing.assert_allclose(table.stamps.time_s, TIME_S, atol=1e-12)
 
 
 @pytest.mark.parametrize("compression", CompressionType)
 def test_a_bag_is_read_as_it_was_written(compression: CompressionType, tmp_path: Path) -> None:
     run_path = tmp_path / "run.mcap"
-    path = write_bag(run_path, whole(), compression=compression, chunk_size=4000)
+    path = write_bag(run_path, recording(), compression=compression, chunk_size=4000)
     assert_whole(read(path))
 
 
 def test_joints_in_another_order_in_each_message_are_the_same_samples(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
-    messages = []
+    contents = []
     for row in range(ROWS):
         order = rng.permutation(6).tolist()
-        messages.append(("/joint_states", message(row, order)))
-    table = read(write_bag(tmp_path / "run.mcap", messages))
+        contents.append(message(row, order))
+    path = write_bag(tmp_path / "run.mcap", joint_states(contents))
+    table = read(path)
     assert_whole(table)
     assert table.remarks == ()
 
@@ -138,9 +159,8 @@ def _repack(source: Path, target: Path, **options: Any) -> Path:
             if channel.id not in channels:
                 number = writer.register_schema(schema.name, schema.encoding, schema.data)
                 channels[channel.id] = writer.register_channel(channel.topic, "cdr", number)
-            writer.add_message(
-                channels[channel.id], content.log_time, content.data, content.publish_time
-            )
+            target_channel = channels[channel.id]
+            writer.add_message(target_channel, content.log_time, content.data, content.publish_time)
         writer.finish()
     return target
 
@@ -152,7 +172,7 @@ def _repack(source: Path, target: Path, **options: Any) -> Path:
 )
 def test_chunks_and_checksums_are_optional(options: dict[str, Any], tmp_path: Path) -> None:
     path = tmp_path / "plain.mcap"
-    plain = write_bag(path, whole())
+    plain = write_bag(path, recording())
     target = tmp_path / "run.mcap"
     table = read(_repack(plain, target, **options))
     assert_whole(table)
@@ -165,25 +185,23 @@ def test_several_publishers_make_one_row_a_stamp(tmp_path: Path) -> None:
     The bag begins after the arm's message of its first stamp, and ends before the wrist's of its
     last one.
     """
-    parts = []
+    contents = []
     for row in range(ROWS):
-        joints = (2, 0, 1)
-        for part in (
-            message(row, joints),
-            message(row, (), name=["finger"]),
-            message(row, (5, 3, 4)),
-        ):
-            parts.append(("/joint_states", part))
+        contents.append(message(row, (2, 0, 1)))
+        contents.append(message(row, (), name=["finger"]))
+        contents.append(message(row, (5, 3, 4)))
+    parts = joint_states(contents)
     path = tmp_path / "run.mcap"
     table = read(write_bag(path, parts))
     assert_whole(table)
     assert table.remarks == ()
+
     cut_path = tmp_path / "cut.mcap"
-    cut = read(write_bag(cut_path, parts[1:-1]))
-    stacked_position = np.hstack((POSITION, EFFORT))
-    expected = stacked_position[1:-1]
-    np.testing.assert_array_equal(cut.values, expected)
+    cut_parts = parts[1:-1]
+    cut = read(write_bag(cut_path, cut_parts))
+    np.testing.assert_array_equal(cut.values, VALUES[1:-1])
     assert cut.remarks == ("left out, as joints are missing at the ends of the bag: 2 stamps",)
+
     messages = [*parts[:32], *parts[33:]]
     gap_path = tmp_path / "gap.mcap"
     with pytest.raises(
@@ -202,24 +220,20 @@ def _unmeasured(row: int) -> dict[str, Any]:
 
 
 def test_messages_before_the_first_reading_are_left_out(tmp_path: Path) -> None:
-    parts = []
-    for row in range(ROWS):
-        parts.append(
-            ("/joint_states", _unmeasured(row) if row in {0, 1, 2, ROWS - 1} else message(row))
-        )
+    contents = [message(row) for row in range(ROWS)]
+    for row in (0, 1, 2, ROWS - 1):
+        contents[row] = _unmeasured(row)
     path = tmp_path / "run.mcap"
-    table = read(write_bag(path, parts))
-    stacked_position = np.hstack((POSITION, EFFORT))
-    np.testing.assert_array_equal(table.values, stacked_position[3:-1])
+    table = read(write_bag(path, joint_states(contents)))
+    np.testing.assert_array_equal(table.values, VALUES[3:-1])
     assert table.stamps is not None
-    expected = START_NS + 3 * STEP_NS
-    assert table.stamps.first_ns == expected
+    assert table.stamps.first_ns == row_ns(3)
     assert table.remarks == ("left out, as values are nan at the ends of the bag: 4 stamps",)
     assert table.place(0, "position.J1") == f"{tmp_path}/run.mcap, row 4, column position.J1"
 
 
 def test_a_reading_that_is_missing_among_others_is_refused(tmp_path: Path) -> None:
-    parts = whole()
+    parts = recording()
     effort = [0.5, float("nan"), 0.5, 0.5, 0.5, 0.5]
     parts[50] = ("/joint_states", message(50, effort=effort))
     path = tmp_path / "run.mcap"
@@ -232,8 +246,7 @@ def test_a_reading_that_is_missing_among_others_is_refused(tmp_path: Path) -> No
         read(bag)
     keep = KeptPart(to_row=50)
     table = read(bag, keep=keep)
-    stacked_position = np.hstack((POSITION, EFFORT))
-    np.testing.assert_array_equal(table.values, stacked_position[:50])
+    np.testing.assert_array_equal(table.values, VALUES[:50])
 
 
 @pytest.mark.parametrize(
@@ -246,33 +259,29 @@ def test_a_reading_that_is_missing_among_others_is_refused(tmp_path: Path) -> No
 )
 def test_a_part_of_a_bag_is_kept(part: KeptPart, rows: slice, tmp_path: Path) -> None:
     run_path = tmp_path / "run.mcap"
-    path = write_bag(run_path, whole())
+    path = write_bag(run_path, recording())
     table = read(path, keep=part)
-    stacked_position = np.hstack((POSITION, EFFORT))
-    np.testing.assert_array_equal(table.values, stacked_position[rows])
+    np.testing.assert_array_equal(table.values, VALUES[rows])
     assert table.stamps is not None
-    expected = START_NS + rows.start * STEP_NS
-    assert table.stamps.first_ns == expected
+    assert table.stamps.first_ns == row_ns(rows.start)
     assert table.first_row == rows.start
 
 
-def _other_publisher(row: int, **changes: Any) -> dict[str, Any]:
+def _other_publisher(row: int, frame: str = "base", **changes: Any) -> dict[str, Any]:
     """A second node with the same joints, halfway between two messages of the first one."""
-    seconds, nanoseconds = divmod(START_NS + row * STEP_NS + STEP_NS // 2, 10**9)
-    header = {"stamp": {"sec": seconds, "nanosec": nanoseconds}, "frame_id": "base"}
+    header = stamped_header(row_ns(row) + STEP_NS // 2, frame)
     position = [0.0] * 6
-    return message(row, header=header, position=position, effort=[], **changes)
+    other = message(row, header=header, position=position, effort=[])
+    return other | changes
 
 
-def _with_another(frame: str = "base", **changes: Any) -> list[tuple[str, dict[str, Any]]]:
-    parts = []
+def _with_another(frame: str = "base", **changes: Any) -> list[Message]:
+    contents = []
     for row in range(ROWS):
-        parts.append(("/joint_states", message(row)))
+        contents.append(message(row))
         if row % 10 == 5:
-            other = _other_publisher(row) | changes
-            other["header"] = other["header"] | {"frame_id": frame}
-            parts.append(("/joint_states", other))
-    return parts
+            contents.append(_other_publisher(row, frame, **changes))
+    return joint_states(contents)
 
 
 @pytest.mark.parametrize(
@@ -291,7 +300,7 @@ def _with_another(frame: str = "base", **changes: Any) -> list[tuple[str, dict[s
     ids=["without effort", "another frame", "some joints"],
 )
 def test_two_publishers_of_the_same_joints_are_named_and_one_is_chosen(
-    parts: list[tuple[str, dict[str, Any]]], other: str, tmp_path: Path
+    parts: list[Message], other: str, tmp_path: Path
 ) -> None:
     path = tmp_path / "run.mcap"
     bag = write_bag(path, parts)
@@ -304,8 +313,7 @@ def test_two_publishers_of_the_same_joints_are_named_and_one_is_chosen(
     assert "`publisher: 1`" in caught.value.remedy
     table = read(bag, publisher=1)
     assert_whole(table)
-    expected = (f"left out, of another publisher: {other}",)
-    assert table.remarks == expected
+    assert table.remarks == (f"left out, of another publisher: {other}",)
     with pytest.raises(
         TableUnfit,
         match=r"found publisher 3, and those of the topic are "
@@ -323,26 +331,31 @@ def test_a_publisher_without_the_field_is_not_chosen_in_silence(tmp_path: Path) 
 
 def _of_sections(position: dict[str, Any], current: dict[str, Any]) -> dict[str, Any]:
     """Sections whose positions and efforts have a topic or a publisher of their own."""
-    columns = COLUMNS[:6]
     moved = PositionColumns(
-        file="run.mcap", columns=columns, unit=PositionUnit.RAD, side=Side.JOINT, **position
+        file="run.mcap",
+        columns=POSITION_COLUMNS,
+        unit=PositionUnit.RAD,
+        side=Side.JOINT,
+        **position,
     )
-    current_columns = CurrentColumns(file="run.mcap", columns=COLUMNS[6:], unit="A", **current)
-    return {
-        "position": moved,
-        "current": current_columns,
-    }
+    measured = CurrentColumns(
+        file="run.mcap",
+        columns=EFFORT_COLUMNS,
+        unit="A",
+        **current,
+    )
+    return {"position": moved, "current": measured}
 
 
-def _apart(
-    effort_topic: str, *, effort_rows: Sequence[int] = range(ROWS)
-) -> list[tuple[str, dict[str, Any]]]:
+def _apart(effort_topic: str, *, effort_rows: Sequence[int] = range(ROWS)) -> list[Message]:
     """Positions in messages of their own, and efforts in others."""
     parts = []
     for row in range(ROWS):
-        parts.append(("/joint_states", message(row, effort=[])))
+        position = message(row, effort=[])
+        parts.append(("/joint_states", position))
         if row in effort_rows:
-            parts.append((effort_topic, message(row, position=[])))
+            effort = message(row, position=[])
+            parts.append((effort_topic, effort))
     return parts
 
 
@@ -361,22 +374,19 @@ def test_positions_and_efforts_of_different_messages_are_joined_by_their_stamps(
     path = tmp_path / "run.mcap"
     bag = write_bag(path, _apart(topic))
     assert_whole(read(bag, **sections))
+
     # Beginning and end are those of the shorter one.
     effort_rows = range(10, ROWS - 20)
     messages = _apart(topic, effort_rows=effort_rows)
-    run_path = tmp_path / "run.mcap"
-    bag = write_bag(run_path, messages)
+    bag = write_bag(path, messages)
     table = read(bag, **sections)
-    stacked_position = np.hstack((POSITION, EFFORT))
-    np.testing.assert_array_equal(table.values, stacked_position[10:-20])
+    np.testing.assert_array_equal(table.values, VALUES[10:-20])
     assert table.stamps is not None
-    expected = START_NS + 10 * STEP_NS
-    assert table.stamps.first_ns == expected
-    assert any(
-        "left out, as other columns have none there: 30 stamps of /joint_states" in one
-        or "30 stamps of the topic (publisher 1)" in one
-        for one in table.remarks
-    )
+    assert table.stamps.first_ns == row_ns(10)
+    remarks = "\n".join(table.remarks)
+    of_topic = "left out, as other columns have none there: 30 stamps of /joint_states"
+    of_publisher = "30 stamps of the topic (publisher 1)"
+    assert of_topic in remarks or of_publisher in remarks
     keep = KeptPart(from_row=3, to_row=52)
     part = read(bag, keep=keep, **sections)
     np.testing.assert_array_equal(part.values, table.values[2:52])
@@ -398,20 +408,18 @@ def test_messages_that_cannot_be_joined_are_named_with_their_rates(tmp_path: Pat
     assert "nothing is interpolated between messages" in caught.value.remedy
     with pytest.raises(TableUnfit, match="`topic` under `position` and `current`"):
         read(bag)
+    absent = _of_sections({"topic": "/joint_states"}, {"topic": "/absent"})
     with pytest.raises(
         TableUnfit, match="found topics /joint_states, /efforts; expected /absent of type"
     ):
-        read(bag, **_of_sections({"topic": "/joint_states"}, {"topic": "/absent"}))
+        read(bag, **absent)
 
 
 @pytest.mark.parametrize("publisher", [None, 1])
 def test_positions_and_efforts_in_separate_messages_have_a_way(
     publisher: int | None, tmp_path: Path
 ) -> None:
-    parts = []
-    for row in range(ROWS):
-        parts.append(("/joint_states", message(row, effort=[])))
-        parts.append(("/joint_states", message(row, position=[])))
+    parts = _apart("/joint_states")
     path = tmp_path / "run.mcap"
     bag = write_bag(path, parts)
     with pytest.raises(TableUnfit, match="write each field to a CSV file") as caught:
@@ -421,20 +429,20 @@ def test_positions_and_efforts_in_separate_messages_have_a_way(
     ) in caught.value.remedy
 
 
-def _alike(every: int, later_ns: int) -> list[tuple[str, dict[str, Any]]]:
+def _same_content(every: int, later_ns: int) -> list[Message]:
     """A second node with the same joints, frame and fields: its stamps alone are others."""
     stamped = []
     for row in range(ROWS):
-        stamped.append((START_NS + row * STEP_NS, message(row)))
-    rows = range(0, ROWS, every)
-    stamped += [(START_NS + row * STEP_NS + later_ns, message(row)) for row in rows]
-    stamped.sort(key=lambda one: one[0])
-    parts = []
-    for stamp_ns, content in stamped:
-        seconds, nanoseconds = divmod(stamp_ns, 10**9)
-        header = {"stamp": {"sec": seconds, "nanosec": nanoseconds}, "frame_id": "base"}
-        parts.append(("/joint_states", {**content, "header": header}))
-    return parts
+        stamp_ns = row_ns(row)
+        stamped.append((stamp_ns, row))
+        if row % every == 0:
+            stamped.append((stamp_ns + later_ns, row))
+    stamped.sort()
+    contents = []
+    for stamp_ns, row in stamped:
+        header = stamped_header(stamp_ns)
+        contents.append(message(row, header=header))
+    return joint_states(contents)
 
 
 @pytest.mark.parametrize(("every", "later_ns"), [(1, 1_000_000), (1, 2_700_000), (5, 1_300_000)])
@@ -442,33 +450,35 @@ def test_two_publishers_with_nothing_but_other_stamps_are_refused(
     every: int, later_ns: int, tmp_path: Path
 ) -> None:
     path = tmp_path / "run.mcap"
-    messages = _alike(every, later_ns)
+    messages = _same_content(every, later_ns)
     bag = write_bag(path, messages)
     with pytest.raises(TableUnfit, match="stamps of two publishers") as caught:
         read(bag)
-    assert f"{ROWS} messages each 0.004 s" in caught.value.found
-    expected = f"{ROWS // every} messages each {0.004 * every:g} s"
-    assert expected in caught.value.found
+    found = caught.value.found
+    other_rows = ROWS // every
+    other_step_s = 0.004 * every
+    assert f"{ROWS} messages each 0.004 s" in found
+    assert f"{other_rows} messages each {other_step_s:g} s" in found
     assert "`frame_id`" in caught.value.remedy
     assert "`rhythm: 1`" in caught.value.remedy
     first = read(bag, rhythm=1)
     assert_whole(first)
     second = read(bag, rhythm=2)
-    stacked_position = np.hstack((POSITION, EFFORT))
-    np.testing.assert_array_equal(second.values, stacked_position[::every])
+    np.testing.assert_array_equal(second.values, VALUES[::every])
     assert second.stamps is not None
     assert second.stamps.first_ns == START_NS + later_ns
 
 
 def test_a_rhythm_is_chosen_only_where_each_message_has_one(tmp_path: Path) -> None:
-    path = write_bag(tmp_path / "run.mcap", whole())
+    path = write_bag(tmp_path / "run.mcap", recording())
     with pytest.raises(
         TableUnfit,
         match=r"found `rhythm: 2`, and no two even rows of stamps; .* "
         r"leave `rhythm` out",
     ):
         read(path, rhythm=2)
-    lost = [one for number, one in enumerate(_alike(1, 1_300_000)) if number != 2 * ROWS - 21]
+    lost = _same_content(1, 1_300_000)
+    del lost[2 * ROWS - 21]
     run_path = tmp_path / "run.mcap"
     with pytest.raises(
         TableUnfit,
@@ -492,15 +502,15 @@ def _write_channels(
             assert schema is not None
             if channel.topic not in channels:
                 topic = int(channel.topic[1:])
-                node = nodes[topic]
-                metadata = {"callerid": node} if node else {}
+                metadata = {}
+                if nodes[topic]:
+                    metadata["callerid"] = nodes[topic]
                 number = writer.register_schema(schema.name, schema.encoding, schema.data)
                 channels[channel.topic] = writer.register_channel(
                     "/joint_states", "cdr", number, metadata
                 )
-            writer.add_message(
-                channels[channel.topic], content.log_time, content.data, content.publish_time
-            )
+            target_channel = channels[channel.topic]
+            writer.add_message(target_channel, content.log_time, content.data, content.publish_time)
         writer.finish()
     return path
 
@@ -530,14 +540,17 @@ def test_publishers_with_a_channel_each_are_named_and_chosen(
     with pytest.raises(TableUnfit, match=named):
         read(bag)
     assert_whole(read(bag, publisher=1))
-    assert not read(bag, publisher=2).values[:, :6].any()
+    other = read(bag, publisher=2)
+    positions = other.values[:, :6]
+    assert not positions.any()
 
 
 def test_channels_after_each_other_are_one_publisher(tmp_path: Path) -> None:
     """A recorder that is set up anew in one file gives the topic another channel."""
     parts = []
     for row in range(ROWS):
-        parts.append((int(row >= ROWS // 2), message(row)))
+        channel = row * 2 // ROWS
+        parts.append((channel, message(row)))
     run_path = tmp_path / "run.mcap"
     path = _write_channels(run_path, parts)
     assert_whole(read(path))
@@ -546,9 +559,12 @@ def test_channels_after_each_other_are_one_publisher(tmp_path: Path) -> None:
 @pytest.mark.parametrize("jitter", [0.02, 0.1, 0.3])
 def test_uneven_stamps_of_one_publisher_are_not_two(jitter: float) -> None:
     random = np.random.default_rng(3)
-    time_s = 0.004 * (np.arange(3000) + jitter * random.uniform(-1.0, 1.0, 3000))
+    steps = np.arange(3000)
+    noise = random.uniform(-1.0, 1.0, 3000)
+    time_s = 0.004 * (steps + jitter * noise)
     assert interleaved(time_s) is None
-    in_turn_s = 0.004 * (np.arange(3000) + jitter * 0.4 * (np.arange(3000) % 2))
+    odd = steps % 2
+    in_turn_s = 0.004 * (steps + jitter * 0.4 * odd)
     assert interleaved(in_turn_s) is None
     lost = np.delete(time_s, random.integers(0, 3000, 200))
     assert interleaved(lost) is None
@@ -556,16 +572,21 @@ def test_uneven_stamps_of_one_publisher_are_not_two(jitter: float) -> None:
 
 def test_the_same_message_twice_is_two_rows(tmp_path: Path) -> None:
     """The resampling decides what duplicates mean."""
-    messages = [whole()[0], *whole()]
+    first, *others = recording()
     path = tmp_path / "run.mcap"
-    bag = write_bag(path, messages)
-    assert len(read(bag).values) == ROWS + 1
+    bag = write_bag(path, [first, first, *others])
+    table = read(bag)
+    assert len(table.values) == ROWS + 1
 
 
 def test_joints_that_are_never_stamped_together_are_refused(tmp_path: Path) -> None:
-    parts = []
+    contents = []
     for row in range(ROWS):
-        parts.append(("/joint_states", message(row, (0, 1, 2) if row % 2 else (3, 4, 5))))
+        joints = (3, 4, 5)
+        if row % 2:
+            joints = (0, 1, 2)
+        contents.append(message(row, joints))
+    parts = joint_states(contents)
     path = tmp_path / "run.mcap"
     with pytest.raises(
         TableUnfit,
@@ -576,20 +597,19 @@ def test_joints_that_are_never_stamped_together_are_refused(tmp_path: Path) -> N
 
 
 def test_without_stamps_the_time_of_recording_is_used(tmp_path: Path) -> None:
-    header = {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""}
-    messages = [(topic, {**one, "header": header}) for topic, one in whole()]
+    header = stamped_header(0, frame="")
+    contents = [message(row, header=header) for row in range(ROWS)]
     path = tmp_path / "run.mcap"
-    table = read(write_bag(path, messages))
+    table = read(write_bag(path, joint_states(contents)))
     assert table.stamps is not None
-    expected = np.arange(ROWS) * 5e-4
-    np.testing.assert_allclose(table.stamps.time_s, expected, atol=1e-12)
+    recorded_s = np.arange(ROWS) * 5e-4
+    np.testing.assert_allclose(table.stamps.time_s, recorded_s, atol=1e-12)
     assert table.remarks == ("200 messages without a stamp: the time of the recording is used",)
 
 
 def _simulated(row: int, joints: Sequence[int] = range(6)) -> dict[str, Any]:
     """A message of a simulator, whose clock starts at 0."""
-    seconds, nanoseconds = divmod(row * STEP_NS, 10**9)
-    header = {"stamp": {"sec": seconds, "nanosec": nanoseconds}, "frame_id": ""}
+    header = stamped_header(row * STEP_NS, frame="")
     return message(row, joints, header=header)
 
 
@@ -599,49 +619,51 @@ def _simulated(row: int, joints: Sequence[int] = range(6)) -> dict[str, Any]:
 def test_a_clock_that_starts_at_0_keeps_its_first_stamp(
     parts: tuple[Sequence[int], ...], tmp_path: Path
 ) -> None:
-    messages = []
+    contents = []
     for row in range(ROWS):
         for joints in parts:
-            messages.append(("/joint_states", _simulated(row, joints)))
+            contents.append(_simulated(row, joints))
     path = tmp_path / "run.mcap"
-    table = read(write_bag(path, messages))
-    expected = np.hstack((POSITION, EFFORT))
-    np.testing.assert_array_equal(table.values, expected)
+    table = read(write_bag(path, joint_states(contents)))
+    np.testing.assert_array_equal(table.values, VALUES)
     assert table.stamps is not None
     assert table.stamps.first_ns == 0
-    np.testing.assert_allclose(table.stamps.time_s, np.arange(ROWS) * 4e-3, atol=1e-12)
+    np.testing.assert_allclose(table.stamps.time_s, TIME_S, atol=1e-12)
     assert table.remarks == ()
 
 
 def test_a_message_without_stamp_among_times_of_day_has_the_time_of_its_recording(
     tmp_path: Path,
 ) -> None:
-    header = {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""}
-    (topic, first), *others = whole()
-    messages = [(topic, {**first, "header": header}), *others]
+    messages = recording()
+    header = stamped_header(0, frame="")
+    messages[0] = ("/joint_states", message(0, header=header))
     path = tmp_path / "run.mcap"
     table = read(write_bag(path, messages))
     assert_whole(table)
     assert table.remarks == ("1 message without a stamp: the time of the recording is used",)
 
 
+def _write_files(folder: Path, count: int, rows: int) -> None:
+    """Write the recording in several files of so many rows."""
+    folder.mkdir()
+    messages = recording()
+    for number in range(count):
+        path = folder / f"bag_{number}.mcap"
+        first = number * rows
+        part = messages[first : first + rows]
+        write_bag(path, part)
+
+
 def test_a_folder_is_one_bag_of_several_files(tmp_path: Path) -> None:
     folder = tmp_path / "bag"
-    folder.mkdir()
-    for number in range(11):
-        path = folder / f"bag_{number}.mcap"
-        messages = whole()[number * 20 : (number + 1) * 20]
-        write_bag(path, messages)
+    _write_files(folder, count=11, rows=20)
     assert_whole(read(folder))
 
 
 def _in_parts(folder: Path, listed: str) -> Path:
     """A bag of three files, with the metadata that its recorder writes."""
-    folder.mkdir()
-    for number in range(3):
-        path = folder / f"bag_{number}.mcap"
-        messages = whole()[number * 80 : (number + 1) * 80]
-        write_bag(path, messages)
+    _write_files(folder, count=3, rows=80)
     metadata = (
         f"rosbag2_bagfile_information:\n  version: 9\n  relative_file_paths:\n{listed}  "
         "topics: []\n"
@@ -650,12 +672,15 @@ def _in_parts(folder: Path, listed: str) -> Path:
     return folder
 
 
-LISTED = "".join(f"  - bag_{number}.mcap\n" for number in range(3))
+LISTED = """\
+  - bag_0.mcap
+  - bag_1.mcap
+  - bag_2.mcap
+"""
+QUOTED = LISTED.replace("  - ", "    - '").replace(".mcap", ".mcap'")
 
 
-@pytest.mark.parametrize(
-    "listed", [LISTED, LISTED.replace("  - ", "    - '").replace(".mcap", ".mcap'")]
-)
+@pytest.mark.parametrize("listed", [LISTED, QUOTED])
 def test_a_bag_that_lacks_a_part_is_refused(listed: str, tmp_path: Path) -> None:
     """Without its last part it would end early, and nothing else shows it."""
     bag_folder = tmp_path / "bag"
@@ -673,10 +698,12 @@ def test_a_bag_that_lacks_a_part_is_refused(listed: str, tmp_path: Path) -> None
 
 
 def test_a_topic_is_chosen(tmp_path: Path) -> None:
+    desired = [9.0] * 6
     others = []
-    for _, one in whole():
-        others.append(("/desired", {**one, "position": [9.0] * 6}))
-    messages = [*others, *whole()]
+    for row in range(ROWS):
+        content = message(row, position=desired)
+        others.append(("/desired", content))
+    messages = [*others, *recording()]
     path = tmp_path / "run.mcap"
     bag = write_bag(path, messages)
     with pytest.raises(
@@ -722,71 +749,72 @@ def test_a_topic_is_chosen(tmp_path: Path) -> None:
 def test_what_a_bag_lacks_is_named(
     columns: tuple[str, ...], changes: dict[str, Any], error: str | None, tmp_path: Path
 ) -> None:
-    messages = [("/joint_states", message(0, **changes))]
+    messages = joint_states([message(0, **changes)])
     path = tmp_path / "run.mcap"
     bag = write_bag(path, messages)
     if error is None:
-        assert read(bag, columns).values.tolist() == [[1.0]]
+        table = read(bag, columns)
+        assert table.values.tolist() == [[1.0]]
         return
     with pytest.raises(TableUnfit, match=error):
         read(bag, columns)
 
 
-def _document(checkout: Path) -> dict[str, object]:
+def _document(checkout: Path) -> dict[str, Any]:
     """An import description of the bag `run.mcap`."""
     position = {"file": "run.mcap", "columns": ["position"], "unit": "rad", "side": "joint"}
     current = {"file": "run.mcap", "columns": ["effort"], "unit": "A"}
-    cell = str(checkout / "configs/cells/demo.yaml")
+    time = {"file": "run.mcap", "column": STAMP, "unit": "ns"}
     return {
         "name": "run",
-        "cell": cell,
+        "cell": str(checkout / "configs/cells/demo.yaml"),
         "position": position,
         "current": current,
-        "time": {"file": "run.mcap", "column": STAMP, "unit": "ns"},
+        "time": time,
     }
+
+
+def _write_description(tmp_path: Path, document: dict[str, Any]) -> Path:
+    """The file of an import description."""
+    path = tmp_path / "run.yaml"
+    path.write_text(json.dumps(document))
+    return path
 
 
 def test_a_bag_is_imported_with_its_joints_as_axes(checkout: Path, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
-    write_bag(path, whole())
-    description = tmp_path / "run.yaml"
+    write_bag(path, recording())
     document = _document(checkout)
-    description.write_text(json.dumps(document))
+    description = _write_description(tmp_path, document)
     out = tmp_path / "log.mcap"
     assert run_verb("import", description, "--data", tmp_path, "--out", out) == 0
     run, _ = load_run(out)
     assert run.rate_hz == pytest.approx(250.0)
     np.testing.assert_allclose(run.position_rad, POSITION, atol=1e-8)
     np.testing.assert_allclose(run.current_a, EFFORT, atol=1e-8)
-    document["position"] = {
-        "file": "run.mcap",
-        "columns": list(JOINTS),
-        "unit": "rad",
-        "side": "joint",
-    }
-    document["current"] = {"file": "run.mcap", "columns": list(JOINTS), "unit": "A"}
-    description.write_text(json.dumps(document))
+
+    document["position"]["columns"] = list(JOINTS)
+    document["current"]["columns"] = list(JOINTS)
+    description = _write_description(tmp_path, document)
     again = tmp_path / "again.mcap"
     assert run_verb("import", description, "--data", tmp_path, "--out", again) == 0
     assert again.read_bytes() == out.read_bytes()
-    time = {"file": "run.mcap", "column": "stamp", "unit": "s"}
-    text = json.dumps({**document, "time": time})
-    description.write_text(text)
-    code = run_verb("import", description, "--data", tmp_path, "--out", tmp_path / "x.mcap")
+
+    document["time"] = {"file": "run.mcap", "column": "stamp", "unit": "s"}
+    description = _write_description(tmp_path, document)
+    refused = tmp_path / "x.mcap"
+    code = run_verb("import", description, "--data", tmp_path, "--out", refused)
     assert code == 4
 
 
-@pytest.mark.parametrize(
-    "columns", [list(JOINTS), ["effort"], [f"position.{name}" for name in JOINTS]]
-)
+@pytest.mark.parametrize("columns", [list(JOINTS), ["effort"], list(POSITION_COLUMNS)])
 def test_a_bag_has_no_temperature(checkout: Path, tmp_path: Path, columns: list[str]) -> None:
     path = tmp_path / "run.mcap"
-    write_bag(path, whole()[:1])
-    description = tmp_path / "run.yaml"
+    write_bag(path, recording()[:1])
     out = tmp_path / "log.mcap"
-    temperature = {"file": "run.mcap", "columns": columns}
-    document = {**_document(checkout), "temperature": temperature}
-    description.write_text(json.dumps(document))
+    document = _document(checkout)
+    document["temperature"] = {"file": "run.mcap", "columns": columns}
+    description = _write_description(tmp_path, document)
     with pytest.raises(
         TableUnfit, match="found `temperature` from a ROS 2 bag; expected a file with temperatures"
     ):
@@ -797,47 +825,47 @@ def test_a_bag_has_no_temperature(checkout: Path, tmp_path: Path, columns: list[
 def test_torques_of_a_bag_come_from_another_field_than_the_currents(
     checkout: Path, tmp_path: Path
 ) -> None:
-    messages = [(topic, {**one, "velocity": one["effort"]}) for topic, one in whole()]
-    write_bag(
-        tmp_path / "run.mcap",
-        messages,
-    )
-    description = tmp_path / "run.yaml"
+    contents = []
+    for row in range(ROWS):
+        content = message(row)
+        content["velocity"] = content["effort"]
+        contents.append(content)
+    path = tmp_path / "run.mcap"
+    write_bag(path, joint_states(contents))
+    document = _document(checkout)
     out = tmp_path / "log.mcap"
+    other_joints = ["K0", "K1", "K2", "K3", "K4", "K5"]
     # The field counts: the effort of other joints is no torque either where that of the axes is a
     # current.
-    for columns in (
-        list(JOINTS),
-        ["effort"],
-        [f"effort.{name}" for name in JOINTS],
-        [f"K{k}" for k in range(6)],
-    ):
-        torque = {"file": "run.mcap", "columns": columns, "side": "joint"}
-        text = json.dumps({**_document(checkout), "torque": torque})
-        description.write_text(text)
+    for columns in (list(JOINTS), ["effort"], list(EFFORT_COLUMNS), other_joints):
+        document["torque"] = {"file": "run.mcap", "columns": columns, "side": "joint"}
+        description = _write_description(tmp_path, document)
         with pytest.raises(
             ConfigurationInconsistent,
             match=r"found effort of run\.mcap, which "
             r"current is read from",
         ):
             import_recording(description, tmp_path, out, software="test")
-    torque = {"file": "run.mcap", "columns": ["velocity"], "side": "joint"}
-    description.write_text(json.dumps({**_document(checkout), "torque": torque}))
+    document["torque"] = {"file": "run.mcap", "columns": ["velocity"], "side": "joint"}
+    description = _write_description(tmp_path, document)
     import_recording(description, tmp_path, out, software="test")
-    assert load_run(out)[0].torque_channels
+    run, _ = load_run(out)
+    assert run.torque_channels
 
 
 def test_a_healthy_bag_is_called_a_bag(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "run.mcap"
-    bag = write_bag(path, whole())
+    bag = write_bag(path, recording())
     target = tmp_path / "sums.mcap"
     sums = _repack(bag, target, enable_data_crcs=True)
+    saved = tmp_path / "saved.mcap"
     for words in (
         ["info", bag],
         ["info", sums],
-        ["salvage", bag, "--out", tmp_path / "saved.mcap"],
+        ["salvage", bag, "--out", saved],
     ):
-        assert main([str(word) for word in words]) == 4
+        arguments = [str(word) for word in words]
+        assert main(arguments) == 4
         error_output = capfd.readouterr().err
         said = " ".join(error_output.split())
         assert "joint states of J1, J2, J3, J4, J5, J6 on /joint_states" in said
@@ -855,7 +883,7 @@ def test_a_healthy_bag_is_called_a_bag(tmp_path: Path, capfd: pytest.CaptureFixt
         TableUnfit,
         match="found topics /chatter; expected a topic of type sensor_msgs/msg/JointState",
     ):
-        read(tmp_path / "text.mcap")
+        read(text_path)
 
 
 def _of_text(path: Path) -> Path:
@@ -870,10 +898,17 @@ def test_a_bag_that_ends_before_its_first_message_is_not_salvaged(
     tmp_path: Path, capfd: pytest.CaptureFixture[str], size: int
 ) -> None:
     path = tmp_path / "run.mcap"
-    bag = write_bag(path, whole())
-    bag.write_bytes(bag.read_bytes()[:size])
-    for words in (["info", bag], ["fit", bag], ["salvage", bag, "--out", tmp_path / "saved.mcap"]):
-        assert main([str(word) for word in words]) == 4
+    bag = write_bag(path, recording())
+    content = bag.read_bytes()
+    bag.write_bytes(content[:size])
+    saved = tmp_path / "saved.mcap"
+    for words in (
+        ["info", bag],
+        ["fit", bag],
+        ["salvage", bag, "--out", saved],
+    ):
+        arguments = [str(word) for word in words]
+        assert main(arguments) == 4
         failure = capfd.readouterr().err
         assert "the begin of a bag of" in failure
         assert "`drivegain salvage`" not in failure
@@ -881,7 +916,7 @@ def test_a_bag_that_ends_before_its_first_message_is_not_salvaged(
 
 def test_a_bag_of_a_killed_recorder_is_called_unfinished(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
-    bag = write_bag(path, whole(), chunk_size=4000)
+    bag = write_bag(path, recording(), chunk_size=4000)
     content = bag.read_bytes()[:-2000]
     bag.write_bytes(content)
     with pytest.raises(LogTruncated, match=r"expected a finished bag; .*mcap recover"):
@@ -900,52 +935,62 @@ def test_a_damaged_bag_is_refused_or_the_same(
     """
     rng = random.Random(seed)
     path = tmp_path_factory.getbasetemp() / "hurt.mcap"
-    path.write_bytes(damaged(bag_bytes, hurt, rng.randrange(len(bag_bytes)), rng, junk_bytes=40))
+    place = rng.randrange(len(bag_bytes))
+    content = damaged(bag_bytes, hurt, place, rng, junk_bytes=40)
+    path.write_bytes(content)
     try:
         table = read(path)
     except DataError as error:
         assert str(path) in str(error)
     else:
-        stacked_position = np.hstack((POSITION, EFFORT))
-        expected = {row.tobytes() for row in stacked_position}
-        tobytes = {row.tobytes() for row in table.values}
-        assert tobytes <= expected
+        rows = {row.tobytes() for row in table.values}
+        recorded_rows = {row.tobytes() for row in VALUES}
+        assert rows <= recorded_rows
 
 
 @pytest.fixture(scope="module")
 def bag_bytes(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     """A bag of some chunks."""
     path = tmp_path_factory.mktemp("bag") / "run.mcap"
-    messages = whole()[:60]
-    return write_bag(path, messages, chunk_size=4000).read_bytes()
+    messages = recording()[:60]
+    bag = write_bag(path, messages, chunk_size=4000)
+    return bag.read_bytes()
 
 
 @settings(deadline=None, max_examples=200, derandomize=True)
 @given(st.binary(max_size=200), st.integers(0, 1))
 def test_any_bytes_are_a_joint_state_or_refused(data: bytes, order: int) -> None:
+    encapsulation = bytes((0, order, 0, 0))
     try:
-        state = joint_state_from_cdr(bytes((0, order, 0, 0)) + data)
+        state = joint_state_from_cdr(encapsulation + data)
     except ValueError:
         return
-    largest_name_count = max(len(state.names), len(state.position), len(state.effort))
-    assert largest_name_count <= len(data)
+    for field in (state.names, state.position, state.effort):
+        assert len(field) <= len(data)
 
 
 def test_a_message_of_the_other_byte_order_is_read() -> None:
-    names = b"".join(struct.pack(">I", 3) + name.encode() + b"\0" + b"\0" for name in ("J1", "J2"))
-    packed = struct.pack(">iII", 5, 6, 1)
-    big = (
-        b"\0\0\0\0" + packed + b"\0\0\0\0" + struct.pack(">I", 2) + names
-        + struct.pack(">I2d", 2, 1.5, -2.5) + struct.pack(">II", 0, 0)
-    )  # fmt: skip
-    state = joint_state_from_cdr(big)
-    expected = (5_000_000_006, ("J1", "J2"), (1.5, -2.5), ())
-    assert (state.stamp_ns, state.names, state.position, state.effort) == expected
+    stamp = struct.pack(">iI", 5, 6)
+    empty_frame = struct.pack(">I", 1) + b"\0\0\0\0"
+    names = struct.pack(">I", 2)
+    for name in (b"J1", b"J2"):
+        names += struct.pack(">I", 3) + name + b"\0\0"
+    positions = struct.pack(">I2d", 2, 1.5, -2.5)
+    no_velocities = struct.pack(">I", 0)
+    no_efforts = struct.pack(">I", 0)
+    fields = (stamp, empty_frame, names, positions, no_velocities, no_efforts)
+
+    state = joint_state_from_cdr(b"\0\0\0\0" + b"".join(fields))
+
+    assert state.stamp_ns == 5_000_000_006
+    assert state.names == ("J1", "J2")
+    assert state.position == (1.5, -2.5)
+    assert state.effort == ()
 
 
 def test_a_joint_twice_in_one_message_is_refused(tmp_path: Path) -> None:
-    twice = message(0, name=["J1", "J1", *JOINTS[2:]])
+    names = ["J1", "J1", *JOINTS[2:]]
+    messages = joint_states([message(0, name=names)])
     path = tmp_path / "run.mcap"
-    messages = [("/joint_states", twice)]
     with pytest.raises(TableUnfit, match="joint J1 twice"):
         read(write_bag(path, messages))

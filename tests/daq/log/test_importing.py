@@ -29,7 +29,7 @@ from daq.config.import_description import ImportDescription
 from daq.config.yaml_file import parse_yaml, read_model
 from daq.errors import ConfigurationInconsistent, ExitCode, OutputFailed, TableUnfit, UsageError
 from daq.log.conversion import load_run
-from daq.log.importing import import_recording, quantise
+from daq.log.importing import Imported, import_recording, quantise
 from daq.log.reader import read_log
 from daq.report.document import json_tree
 from daq.report.log import info_report
@@ -40,17 +40,23 @@ from ident.model.robot import Motion
 from tests.studies.real_runs import ur10
 
 FloatArray = NDArray[np.float64]
-POSITION_NAMES = [f"q{axis}" for axis in range(1, 7)]
-CURRENT_NAMES = [f"i{axis}" for axis in range(1, 7)]
-VELOCITY_NAMES = [f"v{axis}" for axis in range(1, 7)]
+AXIS_NUMBERS = range(1, 7)
+POSITION_NAMES = [f"q{axis}" for axis in AXIS_NUMBERS]
+CURRENT_NAMES = [f"i{axis}" for axis in AXIS_NUMBERS]
+VELOCITY_NAMES = [f"v{axis}" for axis in AXIS_NUMBERS]
 NAMES = [*POSITION_NAMES, *CURRENT_NAMES]
 COUNTS_PER_REVOLUTION = 65536
 """Counts per revolution of every encoder of the demo cell."""
 
 
 def phases_rad(time: FloatArray) -> FloatArray:
-    """Phases of six axes that move alike, a radian after each other, shape (samples, 6)."""
+    """Phases of six axes in the same motion, a radian after each other, shape (samples, 6)."""
     return time[:, None] + np.arange(6)
+
+
+def swing_deg(time: FloatArray, amplitude_deg: float = 20.0) -> FloatArray:
+    """Positions of six axes that swing, shape (samples, 6)."""
+    return amplitude_deg * np.sin(phases_rad(time))
 
 
 def write_table(path: Path, names: Sequence[str], values: FloatArray, delimiter: str = ",") -> None:
@@ -106,7 +112,7 @@ class ImportInputs:
         self.data = folder / "data"
         self.out = folder / "out" / "run.mcap"
         index = np.arange(300)
-        self.joint_deg = 20.0 * np.sin(phases_rad(index / 40.0))
+        self.joint_deg = swing_deg(index / 40.0)
         self.current_a = np.cos(phases_rad(index / 7.0))
 
     def prepare(self) -> ImportInputs:
@@ -158,13 +164,19 @@ class ImportInputs:
 
     def command(self, *options: str) -> list[str]:
         """The words of `drivegain import` for these files."""
-        words = ["import", self.description, "--data", self.data, "--out", self.out, *options]
-        return [str(word) for word in words]
+        words = ["import", self.description, "--data", self.data, "--out", self.out]
+        return [*map(str, words), *options]
 
     def load(self) -> Run:
         """The run of the log."""
         run, _ = load_run(self.out)
         return run
+
+    def split(self, holdout: Path | None) -> Imported:
+        """Import the recording, with its held-out part as another log."""
+        return import_recording(
+            self.description, self.data, self.out, software="test", holdout=holdout
+        )
 
     def run(self) -> int:
         """The command; its exit code."""
@@ -244,7 +256,8 @@ def test_column_numbers_semicolons_and_decimal_commas(inputs: ImportInputs) -> N
     changed_text = text.replace(".", ",")
     path.write_text("exported by X\n" + changed_text, encoding="utf-8-sig")
     position = position_section(columns=[1, 2, 3, 4, 5, 6])
-    current = current_section(columns=[7, 8, 9, 10, 11, 12], factor=0.001)
+    current_columns = [7, 8, 9, 10, 11, 12]
+    current = current_section(columns=current_columns, factor=0.001)
     table = {"delimiter": ";", "decimal": ",", "skip_rows": 1}
     inputs.describe(table=table, position=position, current=current, payload="disc")
     assert inputs.run() == 0
@@ -273,11 +286,12 @@ def test_a_robot_with_a_joint_that_follows_an_axis_is_imported_by_its_axes(
     motion = Motion(run.position_rad, still, still)
     joints = model_of(cell).follow(motion).joints
     expected = np.radians(inputs.joint_deg)
-    actual = joints.position_rad[:, :6]
-    np.testing.assert_allclose(actual, expected, atol=2e-9)
+    axes_rad = joints.position_rad[:, :6]
+    rod_rad = joints.position_rad[:, 6]
+    np.testing.assert_allclose(axes_rad, expected, atol=2e-9)
     joint_rad = np.radians(inputs.joint_deg[:, 4])
     follower_rad = 0.1 - 0.5 * joint_rad
-    np.testing.assert_allclose(joints.position_rad[:, 6], follower_rad, atol=2e-9)
+    np.testing.assert_allclose(rod_rad, follower_rad, atol=2e-9)
 
 
 def test_the_same_files_give_the_same_log(inputs: ImportInputs) -> None:
@@ -297,7 +311,8 @@ def test_nothing_is_lost_by_counting(values: FloatArray) -> None:
     rounding = np.abs(values - raw * quantum)
     assert (rounding <= quantum / 2).all()
     moves = largest > 1e-200
-    assert (quantum[moves] <= 1e-9 * largest[moves]).all()
+    finest = 1e-9 * largest[moves]
+    assert (quantum[moves] <= finest).all()
 
 
 @pytest.mark.parametrize(
@@ -378,8 +393,8 @@ def test_units_by_the_name_of_an_axis_are_compared_with_the_file(
     inputs: ImportInputs, capsys: pytest.CaptureFixture[str]
 ) -> None:
     header = ",".join(NAMES)
-    units = ",".join(["deg"] * 6 + ["A"] * 5 + ["mA"])
-    inputs.spoil_csv(header, f"{header}\n{units}")
+    units = ["deg"] * 6 + ["A"] * 5 + ["mA"]
+    inputs.spoil_csv(header, f"{header}\n{','.join(units)}")
     path = inputs.folder / "configs/cells/demo.yaml"
     of_axes = dict.fromkeys(load_cell(path).axis_names, "A")
     inputs.describe(current=current_section(of_axes))
@@ -407,7 +422,8 @@ def test_every_truncation_that_shows_is_refused(
     last = data.rpartition(b"\n")[2]
     last_comma = last.rindex(b",")
     complete = data.removesuffix(last)
-    for kept_bytes in (3, len(last) // 2, last_comma, last_comma + 1):
+    middle = len(last) // 2
+    for kept_bytes in (3, middle, last_comma, last_comma + 1):
         run_path.write_bytes(complete + last[:kept_bytes])
         _refused(inputs, capsys, 4, "run.csv:301", "the file ends early")
 
@@ -441,7 +457,8 @@ def test_files_of_different_length(
     inputs: ImportInputs, capsys: pytest.CaptureFixture[str]
 ) -> None:
     lines = read_lines(inputs.data / "run.csv")
-    write_lines(inputs.data / "short.csv", lines[:-5])
+    short = inputs.data / "short.csv"
+    write_lines(short, lines[:-5])
     inputs.describe(current=current_section(file="short.csv"))
     _refused(inputs, capsys, 4, "300 rows in run.csv and 295 rows in short.csv")
 
@@ -521,7 +538,7 @@ def test_a_rate_that_is_ten_times_off_is_noticed(
 ) -> None:
     """At 1 kHz the joints reach 80 to 90 % of the slowest limit."""
     time_s = np.arange(1000) / 1000.0
-    inputs.joint_deg = 30.0 * np.sin(phases_rad(2.0 * np.pi * time_s))
+    inputs.joint_deg = swing_deg(2.0 * np.pi * time_s, 30.0)
     inputs.current_a = np.cos(phases_rad(time_s * 140.0))
     inputs.joint_deg[500, 2] += 0.5  # one outlier is not taken for a wrong rate
     inputs.write_recording()
@@ -544,7 +561,7 @@ def test_currents_without_their_sign_are_noticed(
 ) -> None:
     """The log is made, since other programs can read it; a fit refuses it."""
     time_s = np.arange(2000) / 1000.0
-    inputs.joint_deg = 20.0 * np.sin(phases_rad(5.0 * time_s))
+    inputs.joint_deg = swing_deg(5.0 * time_s)
     inputs.current_a = np.cos(phases_rad(30.0 * time_s))
     if size:
         inputs.current_a = np.abs(inputs.current_a)
@@ -611,7 +628,8 @@ def test_a_glitch_that_no_limit_rules_out_is_said_and_left_to_the_fit(
     assert "run.csv:122, column q3, axis J3: a position that leaves its course by up to 1." in said
     run, cell = load_run(inputs.out)
     position_deg = np.degrees(run.position_rad[120, 2])
-    assert position_deg == pytest.approx(inputs.joint_deg[120, 2], abs=1e-4)
+    recorded_deg = inputs.joint_deg[120, 2]
+    assert position_deg == pytest.approx(recorded_deg, abs=1e-4)
     (fault,) = find_faults(run.position_rad, run.current_a, run.rate_hz, cell.ratio)
     assert fault.kind is FaultKind.GLITCH
     assert fault.axis == 2
@@ -621,7 +639,7 @@ def test_a_glitch_that_no_limit_rules_out_is_said_and_left_to_the_fit(
 def test_a_glitch_of_a_current_among_resampled_rows_does_not_reach_the_log(
     inputs: ImportInputs,
 ) -> None:
-    inputs.joint_deg = 20.0 * np.sin(phases_rad(UNEVEN_MS / 160.0))
+    inputs.joint_deg = swing_deg(UNEVEN_MS / 160.0)
     inputs.write_recording()
     _with_time(inputs, UNEVEN_MS)
     assert inputs.run() == 0
@@ -648,7 +666,7 @@ def test_an_axis_at_rest_may_have_no_current(inputs: ImportInputs) -> None:
 def test_a_step_is_found_in_resampled_samples_too(
     inputs: ImportInputs, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    inputs.joint_deg = 20.0 * np.sin(phases_rad(UNEVEN_MS / 160.0))
+    inputs.joint_deg = swing_deg(UNEVEN_MS / 160.0)
     step_deg = np.degrees(0.5)
     inputs.joint_deg[150:, 3] += step_deg
     inputs.write_recording()
@@ -660,7 +678,8 @@ def test_noise_and_a_coarse_encoder_are_no_steps(inputs: ImportInputs) -> None:
     rng = np.random.default_rng(2)
     noise = rng.normal(scale=0.2, size=(300, 6))
     noisy_deg = inputs.joint_deg + noise
-    inputs.joint_deg = np.round(noisy_deg / 0.1) * 0.1
+    steps = np.round(noisy_deg / 0.1)
+    inputs.joint_deg = steps * 0.1
     inputs.write_recording()
     assert inputs.run() == 0
 
@@ -738,8 +757,9 @@ def test_an_import_that_is_terminated_leaves_nothing(inputs: ImportInputs) -> No
         "LogWriter.write = terminate\n"
         "sys.exit(main(sys.argv[1:]))\n"
     )
+    command = [sys.executable, "-c", script, *inputs.command()]
     done = subprocess.run(
-        [sys.executable, "-c", script, *inputs.command()],
+        command,
         cwd=inputs.checkout,
         check=False,
         capture_output=True,
@@ -817,7 +837,8 @@ def test_a_jump_in_the_time_column(inputs: ImportInputs, index: int, shift: floa
     assert inputs.left == []
 
 
-UNEVEN_STEPS_MS = np.random.default_rng(3).choice([3, 5], 299)
+UNEVEN_RNG = np.random.default_rng(3)
+UNEVEN_STEPS_MS = UNEVEN_RNG.choice([3, 5], 299)
 UNEVEN_MS = np.concatenate(([0.0], np.cumsum(UNEVEN_STEPS_MS)))
 
 
@@ -836,7 +857,7 @@ def test_a_uniform_time_column_gives_the_samples_of_a_rate(inputs: ImportInputs)
 def test_jittered_stamps_are_the_sample_times(
     inputs: ImportInputs, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    inputs.joint_deg = 20.0 * np.sin(phases_rad(UNEVEN_MS / 160.0))
+    inputs.joint_deg = swing_deg(UNEVEN_MS / 160.0)
     inputs.current_a = np.cos(phases_rad(UNEVEN_MS / 280.0))
     inputs.write_recording()
     _with_time(inputs, UNEVEN_MS)
@@ -851,7 +872,7 @@ def test_jittered_stamps_are_the_sample_times(
     run = inputs.load()
     time_ms = 1e3 * run.time_s
     position_deg = np.degrees(run.position_rad)
-    expected_deg = 20.0 * np.sin(phases_rad(time_ms / 160.0))
+    expected_deg = swing_deg(time_ms / 160.0)
     position_error_deg = np.abs(position_deg - expected_deg)
     assert position_error_deg.max() < 1e-3
     expected_a = np.cos(phases_rad(time_ms / 280.0))
@@ -860,7 +881,7 @@ def test_jittered_stamps_are_the_sample_times(
     np.testing.assert_allclose(run.current_a, expected_a, atol=atol_a)
 
 
-COUNTS_WITH_WRAPS = np.array([2**30, *[1024] * 5])
+COUNTS_WITH_WRAPS = np.array([2**30, 1024, 1024, 1024, 1024, 1024])
 """Encoder counts a revolution, of which the first wraps in 32 bits."""
 
 
@@ -870,12 +891,14 @@ def _with_counts_that_wrap(inputs: ImportInputs, joint_rad: FloatArray) -> None:
     """
     cell = inputs.folder / "configs/cells/demo.yaml"
     text = cell.read_text(encoding="utf-8")
-    first_changed = text.replace("revolution: 65536", f"revolution: {2**30}", 1)
+    of_30_bits = f"revolution: {2**30}"
+    first_changed = text.replace("revolution: 65536", of_30_bits, 1)
     changed_text = first_changed.replace("revolution: 65536", "revolution: 1024")
     cell.write_text(changed_text, encoding="utf-8")
     motor_rad = joint_rad @ ratio_of(inputs).T
     turns = motor_rad / (2 * pi)
-    all_counts = np.rint(turns * COUNTS_WITH_WRAPS).astype(np.int64)
+    turned_counts = np.rint(turns * COUNTS_WITH_WRAPS)
+    all_counts = turned_counts.astype(np.int64)
     counts = all_counts.astype(np.int32).astype(np.float64)
     counts_steps = np.diff(counts[:, 0])
     absolute_counts_step = np.abs(counts_steps)
@@ -888,7 +911,7 @@ def test_counts_at_a_rate_go_on_over_a_wrap(
     inputs: ImportInputs, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The checks see the motion, not the jumps of the counter; what is too fast is so still."""
-    joint_deg = 30.0 * np.sin(phases_rad(np.arange(300) / 160.0))
+    joint_deg = swing_deg(np.arange(300) / 160.0, 30.0)
     joint_rad = np.radians(joint_deg)
     _with_counts_that_wrap(inputs, joint_rad)
     counted = position_section("counts", "motor")
@@ -897,7 +920,8 @@ def test_counts_at_a_rate_go_on_over_a_wrap(
     inputs.describe(position=counted)
     assert inputs.run() == 0
     first_axis_rad = inputs.load().position_rad[:, 0]
-    np.testing.assert_allclose(first_axis_rad, joint_rad[:, 0], atol=1e-8)
+    expected_rad = joint_rad[:, 0]
+    np.testing.assert_allclose(first_axis_rad, expected_rad, atol=1e-8)
 
 
 def test_counts_without_a_sign_are_those_with_one(
@@ -913,7 +937,8 @@ def test_counts_without_a_sign_are_those_with_one(
     assert inputs.run() == 0
     expected = inputs.load().position_rad
     inputs.out.unlink()
-    unsigned = np.where(counts < 0, counts + 2**32, counts)
+    is_negative = counts < 0
+    unsigned = np.where(is_negative, counts + 2**32, counts)
     assert (unsigned >= 0).all()
     unsigned_steps = np.diff(unsigned, axis=0)
     absolute_unsigned_step = np.abs(unsigned_steps)
@@ -932,7 +957,7 @@ def test_resampled_counts_go_on_over_a_wrap_and_are_finer_than_a_count(
     inputs: ImportInputs,
 ) -> None:
     ratio = ratio_of(inputs)
-    joint_deg = 30.0 * np.sin(phases_rad(UNEVEN_MS / 160.0))
+    joint_deg = swing_deg(UNEVEN_MS / 160.0, 30.0)
     joint_rad = np.radians(joint_deg)
     _with_counts_that_wrap(inputs, joint_rad)
     _with_time(inputs, UNEVEN_MS)
@@ -941,11 +966,13 @@ def test_resampled_counts_go_on_over_a_wrap_and_are_finer_than_a_count(
     assert inputs.run() == 0
     run = inputs.load()
     time_ms = 1e3 * run.time_s
-    expected_deg = 30.0 * np.sin(phases_rad(time_ms / 160.0))
+    expected_deg = swing_deg(time_ms / 160.0, 30.0)
     expected_rad = np.radians(expected_deg)
     position_difference_rad = run.position_rad - expected_rad
-    difference_turns = position_difference_rad @ ratio.T / (2 * pi)
-    error = (difference_turns * COUNTS_WITH_WRAPS)[:, 1:]
+    motor_difference_rad = position_difference_rad @ ratio.T
+    difference_turns = motor_difference_rad / (2 * pi)
+    difference_counts = difference_turns * COUNTS_WITH_WRAPS
+    error = difference_counts[:, 1:]
     assert np.abs(error).max() < 1.0
     rms_error = np.sqrt(np.mean(error**2))
     assert rms_error < 0.35  # once rounded; a second time would make 0.41 of 0.29
@@ -994,7 +1021,8 @@ def test_a_date_in_a_file_is_when_the_run_began(inputs: ImportInputs) -> None:
     for index, row in enumerate(rows):
         second = index // 100
         hundredth = index % 100
-        date = f"2026-03-01T08:00:{second:02d}.{hundredth:02d}+01:00"
+        time_of_day = f"08:00:{second:02d}.{hundredth:02d}"
+        date = f"2026-03-01T{time_of_day}+01:00"
         _, _, values = row.partition(",")
         dated.append(f"{date},{values}")
     assert len(dated) == 301
@@ -1046,8 +1074,7 @@ def test_a_factor_for_each_axis(inputs: ImportInputs, mapping: bool) -> None:
     factors = [0.5, 1, -2.0, 0.1, 3, 1.0]
     factor: object = factors
     if mapping:
-        in_order = [(f"J{axis}", factors[axis - 1]) for axis in range(1, 7)]
-        factor = dict(reversed(in_order))
+        factor = {f"J{axis}": factors[axis - 1] for axis in reversed(AXIS_NUMBERS)}
     inputs.describe(current=current_section(factor=factor))
     assert inputs.run() == 0
     actual = inputs.load().current_a
@@ -1073,7 +1100,8 @@ def test_factors_of_other_axes(
 
 def _with_velocity(inputs: ImportInputs, velocity_deg_s: FloatArray, **changes: Any) -> None:
     values = np.hstack((inputs.joint_deg, inputs.current_a, velocity_deg_s))
-    write_table(inputs.data / "run.csv", [*NAMES, *VELOCITY_NAMES], values)
+    run_path = inputs.data / "run.csv"
+    write_table(run_path, [*NAMES, *VELOCITY_NAMES], values)
     inputs.describe(velocity=velocity_section(**changes))
 
 
@@ -1088,7 +1116,8 @@ def test_velocities_that_agree_change_nothing(inputs: ImportInputs, side: str, u
     assert inputs.run() == 0
     expected = read_log(inputs.out).samples.position_counts
     inputs.out.unlink()
-    noise = np.random.default_rng(0).normal(scale=20.0, size=(300, 6))
+    rng = np.random.default_rng(0)
+    noise = rng.normal(scale=20.0, size=(300, 6))
     velocity = _velocity_deg_s() + noise
     if unit == "rad/s":
         velocity = np.radians(velocity)
@@ -1137,11 +1166,13 @@ def test_the_real_tx40(checkout: Path, shared_data: Path, tmp_path: Path) -> Non
     out = tmp_path / "tx40.mcap"
     description = checkout / "configs/imports/tx40.yaml"
     recordings = shared_data / "tx40"
-    words = ["import", str(description), "--data", str(recordings), "--out", str(out)]
-    assert main(words) == 0
+    words = ["import", description, "--data", recordings, "--out", out]
+    assert main([str(word) for word in words]) == 0
     run, cell = load_run(out)
-    motor_rad = np.loadtxt(recordings / "pos_read_data.csv", delimiter=",", skiprows=1)
-    current = np.loadtxt(recordings / "curr_data.csv", delimiter=",", skiprows=1)
+    position_path = recordings / "pos_read_data.csv"
+    current_path = recordings / "curr_data.csv"
+    motor_rad = np.loadtxt(position_path, delimiter=",", skiprows=1)
+    current = np.loadtxt(current_path, delimiter=",", skiprows=1)
     assert run.position_rad.shape == (45000, 6)
     assert run.rate_hz == pytest.approx(5000.0)
     zero_offset_rad = [axis.zero_offset_rad for axis in cell.axes]
@@ -1191,8 +1222,8 @@ def test_a_full_disk_is_not_reported_as_a_recording(inputs: ImportInputs) -> Non
 # -------------------------------------------------------------------
 
 
-TORQUE_NAMES = [f"t{axis}" for axis in range(1, 7)]
-TEMPERATURE_NAMES = [f"c{axis}" for axis in range(1, 7)]
+TORQUE_NAMES = [f"t{axis}" for axis in AXIS_NUMBERS]
+TEMPERATURE_NAMES = [f"c{axis}" for axis in AXIS_NUMBERS]
 
 
 def with_slow_columns(
@@ -1200,7 +1231,8 @@ def with_slow_columns(
 ) -> None:
     """Add a file of torques and temperatures."""
     values = np.hstack((torque_nm, temperature_c))
-    write_table(inputs.data / "slow.csv", [*TORQUE_NAMES, *TEMPERATURE_NAMES], values)
+    slow_path = inputs.data / "slow.csv"
+    write_table(slow_path, [*TORQUE_NAMES, *TEMPERATURE_NAMES], values)
     torque = {"file": "slow.csv", "columns": TORQUE_NAMES, **changes}
     temperature = {"file": "slow.csv", "columns": TEMPERATURE_NAMES}
     inputs.describe(rate_hz=50, torque=torque, temperature=temperature)
@@ -1212,11 +1244,13 @@ def test_torque_columns_give_a_slope_and_temperature_columns_a_temperature(
 ) -> None:
     ratio = ratio_of(inputs)
     gain = np.array([33.0, 32.0, 24.0, -9.0, 16.0, 6.8])
-    torque = gain * inputs.current_a / np.diag(ratio)
+    motor_torque = gain * inputs.current_a
+    torque = motor_torque / np.diag(ratio)
     if side == "joint":
         torque = torque @ ratio
     grid = np.linspace(25.0, 31.0, 300)
-    temperature_c = grid[:, None] + np.arange(6)
+    later_c = np.arange(6)
+    temperature_c = grid[:, None] + later_c
     torque_nm = 1000.0 * torque
     with_slow_columns(inputs, torque_nm, temperature_c, side=side, factor=0.001)
     assert inputs.run() == 0
@@ -1321,7 +1355,8 @@ def test_a_column_is_read_as_one_thing(
 def test_stamps_in_another_unit_have_no_rate_of_a_robot(inputs: ImportInputs, step: int) -> None:
     stamps = step * np.arange(300.0)
     values = np.column_stack((stamps, inputs.joint_deg, inputs.current_a))
-    write_table(inputs.data / "run.csv", ["t", *NAMES], values)
+    run_path = inputs.data / "run.csv"
+    write_table(run_path, ["t", *NAMES], values)
     inputs.describe(rate_hz=None, time=time_section("s"))
     with pytest.raises(TableUnfit, match="Hz with `unit: s`"):
         import_recording(inputs.description, inputs.data, inputs.out, software="test")
@@ -1331,16 +1366,20 @@ def _two_files(inputs: ImportInputs) -> None:
     """Positions with stamps in one file, currents in another one."""
     stamps_s = 0.004 * np.arange(300)
     with_time = np.column_stack((stamps_s, inputs.joint_deg))
-    write_table(inputs.data / "position.csv", ["t", *POSITION_NAMES], with_time)
-    write_table(inputs.data / "current.csv", CURRENT_NAMES, inputs.current_a)
+    position_path = inputs.data / "position.csv"
+    current_path = inputs.data / "current.csv"
+    write_table(position_path, ["t", *POSITION_NAMES], with_time)
+    write_table(current_path, CURRENT_NAMES, inputs.current_a)
 
 
 def test_times_that_are_kept_are_rows_of_the_other_file(inputs: ImportInputs) -> None:
     """0.4 to 0.8 s at 250 Hz; the files that have no stamps give the same rows."""
     _two_files(inputs)
+    position = position_section(file="position.csv")
+    current = current_section(file="current.csv")
     inputs.describe(
-        position=position_section(file="position.csv"),
-        current=current_section(file="current.csv"),
+        position=position,
+        current=current,
         rate_hz=None,
         time=time_section("s", "position.csv"),
         keep={"from_s": 0.4, "to_s": 0.8},
@@ -1394,27 +1433,24 @@ def test_a_held_out_end_becomes_a_log_of_its_own(inputs: ImportInputs, timed: bo
     if timed:
         time_ms = 1_772_348_400_000.0 + 4.0 * np.arange(300)
         _with_time(inputs, time_ms)
-        inputs.describe(rate_hz=None, time=time_section("ms"), holdout={"from_s": 0.8})
+        time = time_section("ms")
+        inputs.describe(rate_hz=None, time=time, holdout={"from_s": 0.8})
     else:
         inputs.describe(holdout={"from_s": 0.2})
     held_out = inputs.out.with_name("held-out.mcap")
-    imported = import_recording(
-        inputs.description, inputs.data, inputs.out, software="test", holdout=held_out
-    )
+    imported = inputs.split(held_out)
     assert imported.statistics.samples == 200
     assert imported.holdout is not None
     assert imported.holdout.samples == 100
-    runs = [load_run(path)[0] for path in (inputs.out, held_out)]
-    position_rad = [run.position_rad for run in runs]
-    joined = np.vstack(position_rad)
+    fitted, _ = load_run(inputs.out)
+    left_out, _ = load_run(held_out)
+    position_rad = np.vstack((fitted.position_rad, left_out.position_rad))
     expected = np.radians(inputs.joint_deg)
-    np.testing.assert_allclose(joined, expected, atol=2e-9)
-    current_a = [run.current_a for run in runs]
-    stacked_current_a = np.vstack(current_a)
-    np.testing.assert_allclose(stacked_current_a, inputs.current_a, atol=1e-9)
+    np.testing.assert_allclose(position_rad, expected, atol=2e-9)
+    current_a = np.vstack((fitted.current_a, left_out.current_a))
+    np.testing.assert_allclose(current_a, inputs.current_a, atol=1e-9)
     if timed:
-        started_s = runs[1].started_s
-        assert started_s == pytest.approx(1_772_348_400.8, abs=1e-3)
+        assert left_out.started_s == pytest.approx(1_772_348_400.8, abs=1e-3)
     run_id = read_log(inputs.out).head.run.run_id
     assert run_id != read_log(held_out).head.run.run_id
 
@@ -1424,7 +1460,8 @@ def test_the_command_writes_both_logs_and_reports_them(
 ) -> None:
     inputs.describe(holdout={"from_s": 0.2})
     held_out = inputs.out.with_name("held-out.mcap")
-    assert main(inputs.command("--holdout", str(held_out), "--json")) == 0
+    command = inputs.command("--holdout", str(held_out), "--json")
+    assert main(command) == 0
     report = json.loads(capsys.readouterr().out)
     assert report["samples"] == 200
     assert report["holdout"] == {"log": str(held_out), "samples": 100}
@@ -1449,9 +1486,7 @@ def test_a_held_out_part_that_is_none_is_refused(
     inputs.describe(holdout=part)
     held_out = inputs.out.with_name("held-out.mcap") if named else None
     with pytest.raises(error, match=said):
-        import_recording(
-            inputs.description, inputs.data, inputs.out, software="test", holdout=held_out
-        )
+        inputs.split(held_out)
     assert inputs.left == []
 
 
@@ -1460,9 +1495,7 @@ def test_a_log_that_cannot_be_written_leaves_no_held_out_part(inputs: ImportInpu
     inputs.out.write_bytes(b"mine")
     holdout = inputs.out.with_name("held-out.mcap")
     with pytest.raises(UsageError):
-        import_recording(
-            inputs.description, inputs.data, inputs.out, software="test", holdout=holdout
-        )
+        inputs.split(holdout)
     assert inputs.left == ["run.mcap"]
 
 
@@ -1471,9 +1504,10 @@ def test_the_real_ur10_is_split_by_its_description(shared_data: Path, tmp_path: 
     """A ROS 2 bag in SQLite; the two logs are the parts that the studies read past the import."""
     folder = shared_data / "ur10"
     bag = "ur10_exciting_trajectory.db3"
+    cell = folder / "ur10-cell.yaml"
     document = {
         "name": "ur10",
-        "cell": str(folder / "ur10-cell.yaml"),
+        "cell": str(cell),
         "position": position_section("rad", file=bag, columns=["position"]),
         "current": current_section("Nm", file=bag, columns=["effort"]),
         "time": {"file": bag, "column": "header.stamp", "unit": "ns"},
@@ -1508,14 +1542,14 @@ def _file_of_each_axis(inputs: ImportInputs, later_s: float = 0.0, began_s: floa
         current_a = inputs.current_a[:, axis]
         values = np.column_stack((stamps_s, position_deg, current_a))
         file = f"axis{axis + 1}.csv"
-        write_table(inputs.data / file, ["t", "position", "current"], values)
+        path = inputs.data / file
+        write_table(path, ["t", "position", "current"], values)
         files.append(file)
-    inputs.describe(
-        position=position_section(file=files, columns=["position"]),
-        current=current_section(file=files, columns=["current"] * 6),
-        rate_hz=None,
-        time=time_section("s", "axis1.csv"),
-    )
+    current_columns = ["current"] * 6
+    position = position_section(file=files, columns=["position"])
+    current = current_section(file=files, columns=current_columns)
+    time = time_section("s", "axis1.csv")
+    inputs.describe(position=position, current=current, rate_hz=None, time=time)
 
 
 def test_axes_come_from_a_file_each(inputs: ImportInputs) -> None:
@@ -1598,7 +1632,8 @@ def test_currents_of_one_cell_may_have_several_units(inputs: ImportInputs, kind:
     for axis, gain in enumerate(rest[::2]):
         unit = "Nm/N" if axis == 1 else "Nm/Nm"
         after = rest[2 * axis + 1]
-        first += f'nameplate_gain: {gain.strip()}\n    gain_unit: "{unit}"{after}'
+        first += f"nameplate_gain: {gain.strip()}\n"
+        first += f'    gain_unit: "{unit}"{after}'
     cell.write_text(first, encoding="utf-8")
     units = {"J1": "Nm", "J2": "N", "J3": "Nm", "J4": "Nm", "J5": "Nm", "J6": "Nm"}
     stated: object
@@ -1729,11 +1764,13 @@ def test_settings_for_bags_and_csv_are_refused_for_matlab(
     assert inputs.run() == 0
     inputs.out.unlink()
     # The defaults may be stated: they ask for nothing.
-    inputs.describe(position=position, current=current, table={"delimiter": ","}, topic=None)
+    stated_default = {"delimiter": ","}
+    inputs.describe(position=position, current=current, table=stated_default, topic=None)
     assert inputs.run() == 0
     inputs.out.unlink()
     inputs.describe(position=position, current=current, **{setting: value})
-    with pytest.raises(ConfigurationInconsistent, match=f"'run': {setting}: .*{kind}"):
+    pattern = f"'run': {setting}: .*{kind}"
+    with pytest.raises(ConfigurationInconsistent, match=pattern):
         import_recording(inputs.description, inputs.data, inputs.out, software="test")
 
 
@@ -1790,9 +1827,7 @@ def test_one_name_for_both_logs_is_refused_before_anything_is_written(
     link.symlink_to(inputs.out.name)
     for name in (inputs.out, link):
         with pytest.raises(UsageError, match="one name for both logs"):
-            import_recording(
-                inputs.description, inputs.data, inputs.out, software="test", holdout=name
-            )
+            inputs.split(name)
     assert inputs.left == ["link.mcap"]
 
 

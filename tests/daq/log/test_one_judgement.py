@@ -8,6 +8,7 @@ import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Protocol
 
 import pytest
 from hypothesis import given
@@ -64,7 +65,8 @@ def _cycles(count: int = SAMPLES) -> list[int]:
 
 def _times_ns(count: int = SAMPLES, start_ns: int = START_NS) -> list[int]:
     """Stamps at 1 kHz."""
-    return [start_ns + k * 1_000_000 for k in range(count)]
+    end_ns = start_ns + count * 1_000_000
+    return list(range(start_ns, end_ns, 1_000_000))
 
 
 @dataclass
@@ -92,31 +94,34 @@ class MadeUp:
 
     def counted(self, lost: int = 0) -> None:
         """Make the recorder's counts fit the samples."""
-        self.statistics |= {"samples": str(len(self.cycle)), "lost_cycles": str(lost)}
+        self.statistics["samples"] = str(len(self.cycle))
+        self.statistics["lost_cycles"] = str(lost)
 
     def write(self, path: Path) -> Path:
         """The file, with right checksums."""
         content = demo_content(self.checkout)
         readback = self.readback or readback_bytes(content.readback)
         run = run_record(content.run) | self.run
-        genuine = RunStatistics(SAMPLES, lost_cycles=0, missing=(0,) * 6, valid=True)
+        no_missing = (0,) * 6
+        genuine = RunStatistics(SAMPLES, lost_cycles=0, missing=no_missing, valid=True)
         statistics = statistics_record(genuine) | self.statistics
-        records = [
-            HEADER,
-            *(attachment_record(name, data) for name, data in content.files.items()),
-            attachment_record(READBACK, readback),
-            metadata_record(RUN, sealed(run)),
-            *self.extra,
-            *self._chunks(),
-            metadata_record(STATISTICS, sealed(statistics)),
-            *self.after,
-        ]
+        records = [HEADER]
+        for name, data in content.files.items():
+            records.append(attachment_record(name, data))
+        records.append(attachment_record(READBACK, readback))
+        records.append(metadata_record(RUN, sealed(run)))
+        records += self.extra
+        records += self._chunks()
+        records.append(metadata_record(STATISTICS, sealed(statistics)))
+        records += self.after
         return finished_file(path, records)
 
     def _chunks(self) -> Iterator[bytes]:
         for first in range(0, len(self.cycle), CHUNK_SAMPLES):
             last = first + CHUNK_SAMPLES
-            samples = sample_records(self.cycle[first:last], self.time_ns[first:last])
+            cycle = self.cycle[first:last]
+            time_ns = self.time_ns[first:last]
+            samples = sample_records(cycle, time_ns)
             yield chunk_record(TOPICS + samples)
 
 
@@ -126,12 +131,33 @@ def made(checkout: Path) -> MadeUp:
     return MadeUp(checkout)
 
 
-READERS: dict[str, Callable[[Path, Path], object]] = {
-    "read": lambda log, _: read_log(log),
-    "info": lambda log, _: info_report(log),
-    "fit and validate": lambda log, _: load_run(log),
-    "export log": lambda log, out: export_log(log, out / "table.csv", TableFormat.CSV),
-    "export bag": lambda log, out: export_bag(log, out / "bag"),
+def _read(log: Path, _: Path) -> None:
+    read_log(log)
+
+
+def _info(log: Path, _: Path) -> None:
+    info_report(log)
+
+
+def _load(log: Path, _: Path) -> None:
+    load_run(log)
+
+
+def _export_table(log: Path, folder: Path) -> None:
+    export_log(log, folder / "table.csv", TableFormat.CSV)
+
+
+def _export_bag(log: Path, folder: Path) -> None:
+    export_bag(log, folder / "bag")
+
+
+#: What reads a log; an export goes into the folder
+READERS: dict[str, Callable[[Path, Path], None]] = {
+    "read": _read,
+    "info": _info,
+    "fit and validate": _load,
+    "export log": _export_table,
+    "export bag": _export_bag,
 }
 
 
@@ -149,12 +175,14 @@ def test_a_log_of_several_blocks_lasts_from_its_first_stamp_on(
     start_ns: int, checkout: Path, tmp_path: Path
 ) -> None:
     count = 2 * BLOCK_SAMPLES
-    made = MadeUp(checkout, list(range(count)), _times_ns(count, start_ns))
+    cycles = list(range(count))
+    made = MadeUp(checkout, cycles, _times_ns(count, start_ns))
     made.counted()
     log = made.write(tmp_path / "a.mcap")
     described = info_report(log)
+    duration_s = (count - 1) * 1e-3
     assert described.samples == count
-    assert described.stamped_duration_s == pytest.approx((count - 1) * 1e-3)
+    assert described.stamped_duration_s == pytest.approx(duration_s)
 
 
 Change = Callable[[MadeUp], None]
@@ -191,35 +219,46 @@ def _counted_missing(made: MadeUp) -> None:
 
 
 def _second_readback(made: MadeUp) -> None:
-    made.extra.append(attachment_record(READBACK, b'{"axes": []}'))
+    record = attachment_record(READBACK, b'{"axes": []}')
+    made.extra.append(record)
 
 
 def _second_run(made: MadeUp) -> None:
-    made.extra.append(metadata_record(RUN, sealed({"rate_hz": "1"})))
+    run = sealed({"rate_hz": "1"})
+    made.extra.append(metadata_record(RUN, run))
 
 
 def _second_summary(made: MadeUp) -> None:
-    made.after.append(metadata_record(STATISTICS, sealed({"valid": "true"})))
+    statistics = sealed({"valid": "true"})
+    made.after.append(metadata_record(STATISTICS, statistics))
 
 
-#: a change of a sound log, and the message that refuses it
-CONTRADICTIONS: dict[str, tuple[Change, str]] = {
-    "chunks cut out": (_cut_out, "100 samples; expected 300, as its recorder counted"),
-    "chunks cut out and not counted": (
-        _cut_and_counted,
-        "100 lost cycles; expected 0, as its recorder counted",
-    ),
-    "a chunk twice": (_chunk_twice, "350 samples; expected 300"),
-    "renumbered cycles": (_renumbered, "200 samples; expected 300"),
-    "answers that were not missing": (
-        _counted_missing,
-        r"\[0, 0, 0, 0, 0, 0\] missing answers of its axes; expected \[0, 1",
-    ),
-    "no samples": (_without_samples, "no samples"),
-    "a second readback": (_second_readback, "a second attachment 'readback.json'"),
-    "a second run": (_second_run, "a second metadata 'drivegain.run'"),
-    "a second summary": (_second_summary, "a second metadata 'drivegain.statistics'"),
+@dataclass(frozen=True)
+class Refused:
+    """A change of a sound log, and the message that refuses it."""
+
+    change: Change
+    message: str
+
+
+CHUNKS_NOT_COUNTED = Refused(
+    _cut_and_counted, "100 lost cycles; expected 0, as its recorder counted"
+)
+NOT_MISSING = Refused(
+    _counted_missing, r"\[0, 0, 0, 0, 0, 0\] missing answers of its axes; expected \[0, 1"
+)
+CONTRADICTIONS = {
+    "chunks cut out": Refused(_cut_out, "100 samples; expected 300, as its recorder counted"),
+    "chunks cut out and not counted": CHUNKS_NOT_COUNTED,
+    "a chunk twice": Refused(_chunk_twice, "350 samples; expected 300"),
+    "renumbered cycles": Refused(_renumbered, "200 samples; expected 300"),
+    "answers that were not missing": NOT_MISSING,
+    "no samples": Refused(_without_samples, "no samples"),
+    "a second readback": Refused(_second_readback, "a second attachment 'readback.json'"),
+    "a second run": Refused(_second_run, "a second metadata 'drivegain.run'"),
+    "a second summary": Refused(_second_summary, "a second metadata 'drivegain.statistics'"),
 }
+WITH_SAMPLES = [kind for kind in CONTRADICTIONS if kind != "no samples"]
 
 
 @pytest.mark.parametrize("reader", READERS)
@@ -227,20 +266,19 @@ CONTRADICTIONS: dict[str, tuple[Change, str]] = {
 def test_a_log_that_contradicts_itself_is_refused_by_all(
     kind: str, reader: str, made: MadeUp, tmp_path: Path
 ) -> None:
-    change, message = CONTRADICTIONS[kind]
-    change(made)
+    case = CONTRADICTIONS[kind]
+    case.change(made)
     log = made.write(tmp_path / "a.mcap")
-    with pytest.raises(LogUnreadable, match=message):
+    with pytest.raises(LogUnreadable, match=case.message):
         READERS[reader](log, tmp_path)
     assert list(tmp_path.iterdir()) == [log]
 
 
-@pytest.mark.parametrize("kind", [kind for kind in CONTRADICTIONS if kind != "no samples"])
+@pytest.mark.parametrize("kind", WITH_SAMPLES)
 def test_a_salvage_of_a_log_that_contradicts_itself_is_not_valid_or_refused(
     kind: str, made: MadeUp, tmp_path: Path
 ) -> None:
-    change, _ = CONTRADICTIONS[kind]
-    change(made)
+    CONTRADICTIONS[kind].change(made)
     try:
         damaged = made.write(tmp_path / "a.mcap")
         saved = salvage(damaged, tmp_path / "saved.mcap")
@@ -251,39 +289,61 @@ def test_a_salvage_of_a_log_that_contradicts_itself_is_not_valid_or_refused(
     assert read_log(saved.log).partial
 
 
-#: a change of a sound log, the lost cycles that are counted, and the reason that it is invalid
-LOSSES: dict[str, tuple[Change, int, str]] = {
-    "lost cycles": (_lost_cycles, 100, "cycle 210 after 109 (1 gaps)"),
-    "a chunk twice, counted": (_chunk_twice, 0, "cycle 110 after 159 (1 gaps)"),
-    "renumbered and counted": (
-        _renumbered,
-        0,
-        "cycle 110 101 ms after cycle 109, its most uneven step",
-    ),
+@dataclass(frozen=True)
+class Loss:
+    """A change of a sound log, the lost cycles that are counted, and why it is invalid."""
+
+    change: Change
+    lost: int
+    reason: str
+
+
+RENUMBERED = Loss(_renumbered, 0, "cycle 110 101 ms after cycle 109, its most uneven step")
+LOSSES = {
+    "lost cycles": Loss(_lost_cycles, 100, "cycle 210 after 109 (1 gaps)"),
+    "a chunk twice, counted": Loss(_chunk_twice, 0, "cycle 110 after 159 (1 gaps)"),
+    "renumbered and counted": RENUMBERED,
 }
+
+
+class Judgement(Protocol):
+    """What a verb says of a log."""
+
+    @property
+    def valid(self) -> bool: ...
+
+    @property
+    def reason(self) -> str: ...
+
+
+def _assert_invalid(judgement: Judgement, reason: str) -> None:
+    assert judgement.valid is False
+    assert judgement.reason == reason
 
 
 @pytest.mark.parametrize("kind", LOSSES)
 def test_a_log_that_no_fit_takes_is_called_invalid_by_all(
     kind: str, made: MadeUp, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    change, lost, reason = LOSSES[kind]
-    change(made)
-    made.counted(lost)
+    loss = LOSSES[kind]
+    loss.change(made)
+    made.counted(loss.lost)
     log = made.write(tmp_path / "a.mcap")
     with pytest.raises(DataError) as refused:
         load_run(log)
-    assert refused.value.found == reason
+    assert refused.value.found == loss.reason
+
     described = info_report(log)
-    assert (described.valid, described.reason) == (False, reason)
+    _assert_invalid(described, loss.reason)
     table = export_log(log, tmp_path / "a.csv", TableFormat.CSV)
-    assert (table.valid, table.reason) == (False, reason)
+    _assert_invalid(table, loss.reason)
     bag = export_bag(log, tmp_path / "bag")
-    assert (bag.valid, bag.reason) == (False, reason)
+    _assert_invalid(bag, loss.reason)
     part = log.rename(tmp_path / "a.mcap.part")
     saved = salvage(part, tmp_path / "saved.mcap")
-    assert (saved.statistics.valid, saved.statistics.reason) == (False, reason)
-    arguments = ["export", "log", str(part), "--csv", "--out", str(tmp_path / "b.csv")]
+    _assert_invalid(saved.statistics, loss.reason)
+    out = tmp_path / "b.csv"
+    arguments = ["export", "log", str(part), "--csv", "--out", str(out)]
     assert main(arguments) == ExitCode.OK
     assert "INVALID" in capsys.readouterr().err
 
@@ -316,8 +376,10 @@ def test_a_number_of_400_digits_in_the_summary_is_refused(
 
 
 def test_a_serial_number_of_400_digits_is_none(made: MadeUp, tmp_path: Path) -> None:
-    readback = json.loads(readback_bytes(demo_content(made.checkout).readback))
-    readback["axes"][0]["drive"]["serial"] = int(ATTACKER_DIGITS)
+    content = demo_content(made.checkout)
+    readback = json.loads(readback_bytes(content.readback))
+    drive = readback["axes"][0]["drive"]
+    drive["serial"] = int(ATTACKER_DIGITS)
     made.readback = json.dumps(readback).encode()
     log = made.write(tmp_path / "a.mcap")
     run, _ = load_run(log)
@@ -326,11 +388,13 @@ def test_a_serial_number_of_400_digits_is_none(made: MadeUp, tmp_path: Path) -> 
 
 
 def _many_attachments(made: MadeUp) -> None:
-    made.extra.extend(attachment_record(f"a{k}", b"") for k in range(LARGEST_ENTRIES))
+    for number in range(LARGEST_ENTRIES):
+        made.extra.append(attachment_record(f"a{number}", b""))
 
 
 def _many_metadata(made: MadeUp) -> None:
-    made.extra.extend(metadata_record(f"a{k}", {}) for k in range(LARGEST_ENTRIES))
+    for number in range(LARGEST_ENTRIES):
+        made.extra.append(metadata_record(f"a{number}", {}))
 
 
 def _long_operator(made: MadeUp) -> None:
@@ -342,15 +406,18 @@ def _long_reason(made: MadeUp) -> None:
 
 
 def _long_attachment(made: MadeUp) -> None:
-    made.extra.append(attachment_record("notes", b"x" * LONG_TEXT_BYTES))
+    notes = b"x" * LONG_TEXT_BYTES
+    made.extra.append(attachment_record("notes", notes))
 
 
-LARGE: dict[str, tuple[Change, str]] = {
-    "attachments": (_many_attachments, f"more than {LARGEST_ENTRIES} attachments"),
-    "metadata": (_many_metadata, f"more than {LARGEST_ENTRIES} attachments"),
-    "a text among the metadata": (_long_operator, "of 30000[0-9]+ bytes"),
-    "a text as its reason": (_long_reason, "of 30000[0-9]+ bytes"),
-    "an attachment": (_long_attachment, "'notes' of 30000000 bytes"),
+TOO_MANY = f"more than {LARGEST_ENTRIES} attachments"
+TOO_LONG = "of 30000[0-9]+ bytes"
+LARGE = {
+    "attachments": Refused(_many_attachments, TOO_MANY),
+    "metadata": Refused(_many_metadata, TOO_MANY),
+    "a text among the metadata": Refused(_long_operator, TOO_LONG),
+    "a text as its reason": Refused(_long_reason, TOO_LONG),
+    "an attachment": Refused(_long_attachment, "'notes' of 30000000 bytes"),
 }
 
 
@@ -359,18 +426,19 @@ LARGE: dict[str, tuple[Change, str]] = {
 def test_a_log_has_no_more_and_no_larger_texts_than_a_recorder_writes(
     kind: str, made: MadeUp, tmp_path: Path
 ) -> None:
-    change, message = LARGE[kind]
-    change(made)
+    case = LARGE[kind]
+    case.change(made)
     log = made.write(tmp_path / "a.mcap")
     for read in READERS.values():
-        with pytest.raises(LogUnreadable, match=message):
+        with pytest.raises(LogUnreadable, match=case.message):
             read(log, tmp_path)
 
 
 def _message(channel: int, data: bytes) -> bytes:
     """A message record: its channel, a number and two times that are zero, and its data."""
     channel_bytes = channel.to_bytes(2, "little")
-    return raw_record(Opcode.MESSAGE, channel_bytes + bytes(20) + data)
+    number_and_times = bytes(20)
+    return raw_record(Opcode.MESSAGE, channel_bytes + number_and_times + data)
 
 
 def _event(text: str) -> bytes:
@@ -394,7 +462,8 @@ def test_few_bytes_of_equal_messages_take_neither_gigabytes_nor_minutes(
     """The budget is that of a file; a hundredth of it keeps the test short."""
     monkeypatch.setattr("daq.log.container.RECORDS", RECORDS // 100)
     count = 2 * allowed // 100
-    made.extra.append(chunk_record(TOPICS + message * count))
+    chunk = chunk_record(TOPICS + message * count)
+    made.extra.append(chunk)
     log = made.write(tmp_path / "a.mcap")
     assert log.stat().st_size < 100_000
     reader = LogReader(log)
@@ -405,12 +474,15 @@ def test_few_bytes_of_equal_messages_take_neither_gigabytes_nor_minutes(
 
 # -- columns of an export
 
-NAMES = st.lists(st.text("A1_+-.", min_size=1, max_size=4), min_size=6, max_size=6, unique=True)
+_names = st.text("A1_+-.", min_size=1, max_size=4)
+NAMES = st.lists(_names, min_size=6, max_size=6, unique=True)
 
 
 @given(NAMES)
 def test_every_axis_keeps_columns_of_its_own(cell: Cell, names: Sequence[str]) -> None:
-    axes = tuple(replace(axis, name=name) for axis, name in zip(cell.axes, names, strict=True))
-    renamed_cell = replace(cell, axes=axes)
+    axes = []
+    for axis, name in zip(cell.axes, names, strict=True):
+        axes.append(replace(axis, name=name))
+    renamed_cell = replace(cell, axes=tuple(axes))
     columns = column_names(renamed_cell)
     assert len(set(columns)) == 6

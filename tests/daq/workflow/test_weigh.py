@@ -11,9 +11,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from rich.console import Console, RenderableType
 
 from daq.cli import main
+from daq.config.cell import Cell
 from daq.config.cell_file import load_cell
 from daq.documents.calibration_file import load_calibration, save_calibration
 from daq.errors import ExitCode
@@ -29,47 +31,59 @@ from ident.weighing import Help, Scale, WeighedBody
 from tests.daq.calibrations import demo_calibration
 from tests.daq.logs import DISC, demo_content, samples, write
 
+FloatArray = NDArray[np.float64]
+
+
+def _demo(checkout: Path) -> Cell:
+    return load_cell(checkout / "configs/cells/demo.yaml")
+
+
+def _five_bar(checkout: Path) -> Cell:
+    return load_cell(checkout / "configs/cells/five-bar.yaml")
+
+
+def _one_line(text: str) -> str:
+    """A printed text without its line breaks."""
+    return " ".join(text.split())
+
 
 @pytest.mark.slow
 def test_a_real_robot_that_touched_nothing(
     real: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file, log = real
-    options = ["--calibration", str(file), "--pictures", str(tmp_path / "new")]
+    pictures = tmp_path / "new"
+    options = ["--calibration", str(file), "--pictures", str(pictures)]
     assert main(["contact", str(log), *options, "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["band_from_this_log"]
-    expected = ["J1", "J2", "J3", "J4", "J5", "J6"]
-    assert [axis["axis"] for axis in found["axes"]] == expected
+    axes = [axis["axis"] for axis in found["axes"]]
+    assert axes == ["J1", "J2", "J3", "J4", "J5", "J6"]
     for axis in found["axes"]:
         assert 0.0 < axis["band"] < axis["threshold"]
     assert found["contacts"] == []
-    path = Path(found["picture"])
-    assert path.read_bytes().startswith(b"\x89PNG")
+    picture = Path(found["picture"]).read_bytes()
+    assert picture.startswith(b"\x89PNG")
 
 
 def test_a_log_is_not_its_own_quiet_motion(
     real: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    file, log = real
-    assert (
-        main(["contact", str(log), "--calibration", str(file), "--quiet", str(log)])
-        == ExitCode.DATA_UNFIT
-    )
+    file, log = map(str, real)
+    arguments = ["contact", log, "--calibration", file, "--quiet", log]
+    assert main(arguments) == ExitCode.DATA_UNFIT
     assert "the same log twice" in capsys.readouterr().err
 
 
 def test_quiet_motion_that_the_fit_has_seen_is_warned_of(caplog: pytest.LogCaptureFixture) -> None:
     calibration = demo_calibration()
     rest = np.zeros((4, 6))
-    runs = [
-        Run(name, np.arange(4.0), rest, rest, digest=key * 64)
-        for name, key in (("seen", "a"), ("held", "d"))
-    ]
-    warn = warn_of_fitted(calibration, runs[1:], "no matter")
-    assert warn == ()
+    time_s = np.arange(4.0)
+    seen = Run("seen", time_s, rest, rest, digest="a" * 64)
+    held_out = Run("held", time_s, rest, rest, digest="d" * 64)
+    assert warn_of_fitted(calibration, [held_out], "no matter") == ()
     assert caplog.messages == []
-    assert warn_of_fitted(calibration, runs, "no proof") == ("seen",)
+    assert warn_of_fitted(calibration, [seen, held_out], "no proof") == ("seen",)
     assert caplog.messages == ["seen was part of the fit: no proof"]
 
 
@@ -77,15 +91,19 @@ def test_quiet_motion_that_the_fit_has_seen_is_warned_of(caplog: pytest.LogCaptu
 def test_a_real_flange_without_a_body_weighs_nothing(
     real: tuple[Path, Path], capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
 ) -> None:
-    file, log = real
-    assert main(["weigh", str(log), "--calibration", str(file)]) == 0
+    file, log = map(str, real)
+    arguments = ["weigh", log, "--calibration", file]
+    assert main(arguments) == 0
     text = capsys.readouterr().out
     assert text.startswith("No body shows: the mass is within two σ of nothing.\n")
     assert "centre" not in text
-    mass, std = map(float, text.partition("mass  ")[2].split("kg")[0].split("±"))
-    assert abs(mass) < 3.0 * std < 0.3
+    behind_name = text.partition("mass  ")[2]
+    mass_and_std = behind_name.split("kg")[0]
+    mass, std = map(float, mass_and_std.split("±"))
+    three_sigma = 3.0 * std
+    assert abs(mass) < three_sigma < 0.3
     assert caplog.messages[0].startswith("tx40 was part of the fit: the agreement proves nothing")
-    assert main(["weigh", str(log), "--calibration", str(file), "--json"]) == 0
+    assert main([*arguments, "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
     assert document["part_of_the_fit"] == ["tx40"]
 
@@ -106,13 +124,11 @@ def test_a_cell_that_was_corrected_since_is_not_corrected_twice_unsaid(
         save_calibration(changed, known)
         caplog.clear()
         assert main([verb, str(log), "--calibration", str(known)]) == ExitCode.OK
-        texts = [
-            text
-            for text in caplog.messages
-            if "another description of the cell than the fit" in text
-        ]
+        other_description = "another description of the cell than the fit"
+        texts = [text for text in caplog.messages if other_description in text]
         assert len(texts) == warned
-        assert all(f"zero-offset on {axis}" in text for text in texts)
+        for text in texts:
+            assert f"zero-offset on {axis}" in text
 
 
 @pytest.mark.slow
@@ -120,12 +136,16 @@ def test_a_calibration_comes_first_or_as_an_option(
     real: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
     file, log = map(str, real)
+    calibration_first = [file, log]
+    as_option = [log, "--calibration", file]
+    as_word = [f"--calibration={file}", log]
     for verb in ("weigh", "validate"):
         printed = []
-        for words in ([file, log], [log, "--calibration", file], [f"--calibration={file}", log]):
+        for words in (calibration_first, as_option, as_word):
             assert main([verb, *words, "--json"]) == ExitCode.OK
             printed.append(capsys.readouterr().out)
-        assert printed[0] == printed[1] == printed[2]
+        assert printed[0] == printed[1]
+        assert printed[1] == printed[2]
 
 
 @pytest.mark.slow
@@ -134,21 +154,26 @@ def test_a_log_that_declares_a_payload_is_not_bare(
 ) -> None:
     file, _ = real
     calibration = load_calibration(file)
-    axes = tuple(
-        replace(gain, axis=f"J{index + 1}") for index, gain in enumerate(calibration.gains)
-    )
-    changed_calibration = replace(calibration, cell="demo", gains=axes)
-    save_calibration(changed_calibration, tmp_path / "calibration.yaml")
-    angle = np.rint(20000.0 * np.sin(np.arange(2500)[:, None] / 200.0 + np.arange(6))).astype(int)
-    path = tmp_path / "a.mcap"
-    log = str(write(path, demo_content(checkout, DISC), samples(angle.tolist())))
-    known = ["--calibration", str(tmp_path / "calibration.yaml")]
+    gains = []
+    for index, gain in enumerate(calibration.gains):
+        gains.append(replace(gain, axis=f"J{index + 1}"))
+    of_demo = replace(calibration, cell="demo", gains=tuple(gains))
+    calibration_file = tmp_path / "calibration.yaml"
+    save_calibration(of_demo, calibration_file)
+    known = ["--calibration", str(calibration_file)]
+    time = np.arange(2500)[:, None] / 200.0
+    phase_rad = time + np.arange(6)
+    angle = np.rint(20000.0 * np.sin(phase_rad)).astype(int)
+    other_angle = angle + 1
+    log = str(tmp_path / "a.mcap")
+    bare = str(tmp_path / "b.mcap")
+    write(Path(log), demo_content(checkout, DISC), samples(angle.tolist()))
+    write(Path(bare), demo_content(checkout), samples(other_angle.tolist()))
+
     assert main(["weigh", log, "--bare", log, *known]) == 4
     assert "found:    payload 'disc'" in capsys.readouterr().err
     assert main(["weigh", log, log, *known]) == 4
     assert "found:    the same log twice" in capsys.readouterr().err
-    b_path = tmp_path / "b.mcap"
-    bare = str(write(b_path, demo_content(checkout), samples((angle + 1).tolist())))
     for logs, mixed in (([bare, log], log), ([log, bare], bare)):
         assert main(["weigh", *logs, *known]) == 4
         said = capsys.readouterr().err
@@ -168,43 +193,57 @@ def _text(parts: Iterable[RenderableType], width: int = 160) -> str:
     return printed.get()
 
 
+def _weighed(
+    cell: Cell, values: FloatArray, std: FloatArray, *, has_covariance: bool = True
+) -> Weighed:
+    """A body that was weighed once, by a calibration with its covariance or without."""
+    covariance = np.diag(std**2)
+    axes = (2.0,) * len(cell.axes)
+    error = RelativeError(axes, 2.0)
+    scale = Scale.__new__(Scale)
+    body = WeighedBody(values, covariance, covariance, has_covariance, 20, error, scale)
+    logs = (Path("a.mcap"),)
+    return Weighed(cell, logs, (), body, (), 5.0)
+
+
 def test_a_weighed_body_is_shown_with_what_would_help(checkout: Path) -> None:
-    cell = load_cell(checkout / "configs/cells/demo.yaml")
     ten = np.array([0.07, -0.02, 0.02, 0.07, 0.03, 0.05, -0.24, -0.25, np.nan, 4.6])
     std = np.where(np.isnan(ten), np.nan, 0.01)
-    covariance = np.diag(std**2)
-    scale = Scale.__new__(Scale)
-    axes = (2.0,) * 6
-    error = RelativeError(axes, 2.0)
-    body = WeighedBody(ten, covariance, covariance, False, 20, error, scale)
     helped = Help("mz", "fast moves of all axes", 5.0, 0.004)
-    logs = (Path("a.mcap"),)
-    found = Weighed(cell, logs, (), body, (helped,), 4.59)
+    weighed = _weighed(_demo(checkout), ten, std, has_covariance=False)
+    found = replace(weighed, help=(helped,), declared_kg=4.59)
     text = _text(weighed_view(found))
     assert "4.600 ± 0.010" in text
     assert "+0.22 %" in text
     assert "mz: add 5 s of fast moves of all axes (σ 0.004)" in text
     assert "no covariance" in text
+    assert "tolerance" not in text
     narrow = _text(weighed_view(found), width=80)
     assert re.search(r"Ixx +0\.070 ± 0\.010 +kg m² +yes", narrow)
     assert "…" not in narrow
+
     report = weigh_report(found)
     assert report.mass_kg.value == 4.6
     assert report.mass_kg.std == pytest.approx(0.01)
-    assert [one.name for one in report.parameters] == list(LINK_PARAMETERS)
-    assert [one.name for one in report.parameters if one.add is not None] == ["mz"]
-    assert [one.name for one in report.parameters if not one.identifiable] == ["mz"]
-    assert "tolerance" not in text
+    names = [one.name for one in report.parameters]
+    assert names == list(LINK_PARAMETERS)
+    with_help = [one.name for one in report.parameters if one.add is not None]
+    assert with_help == ["mz"]
+    not_identifiable = [one.name for one in report.parameters if not one.identifiable]
+    assert not_identifiable == ["mz"]
     assert report.mass_std_of_reference_kg == 0.0
+
     reference = np.full((10, 10), 1e-6)
-    changed_body = replace(body, reference_covariance=reference)
-    tolerant = replace(found, body=changed_body)
-    assert ("with the tolerance of the calibration's payload mass") in " ".join(
-        _text(weighed_view(tolerant)).split()
-    )
+    uncertain_body = replace(found.body, reference_covariance=reference)
+    tolerant = replace(found, body=uncertain_body)
+    tolerant_text = _one_line(_text(weighed_view(tolerant)))
+    assert "with the tolerance of the calibration's payload mass" in tolerant_text
     mass_std_of_reference_kg = weigh_report(tolerant).mass_std_of_reference_kg
     assert mass_std_of_reference_kg == pytest.approx(0.001)
-    nothing = replace(found, body=replace(body, values=np.full(10, 0.001)), declared_kg=None)
+
+    small_values = np.full(10, 0.001)
+    small_body = replace(found.body, values=small_values)
+    nothing = replace(found, body=small_body, declared_kg=None)
     assert "No body shows" in _text(weighed_view(nothing))
 
 
@@ -212,54 +251,56 @@ def test_the_centre_is_shown_in_the_platforms_frame_too(checkout: Path) -> None:
     """The plate of the five-bar is 450 mm from its joint;
     a planar robot shows Izz, two first moments and the mass.
     """
-    cell = load_cell(checkout / "configs/cells/five-bar.yaml")
-    ten = np.array([np.nan] * 5 + [1.0, 2.16, 0.15, np.nan, 5.0])
+    ten = np.full(10, np.nan)
+    ten[5:8] = (1.0, 2.16, 0.15)
+    ten[9] = 5.0
     std = np.where(np.isnan(ten), np.nan, 0.02)
     std[5] = 0.2
-    covariance = np.diag(std**2)
-    axes = (2.0,) * 2
-    error = RelativeError(axes, 2.0)
-    body = WeighedBody(ten, covariance, covariance, True, 20, error, Scale.__new__(Scale))
-    logs = (Path("a.mcap"),)
-    found = Weighed(cell, logs, (), body, (), 5.0)
+    found = _weighed(_five_bar(checkout), ten, std)
     text = _text(weighed_view(found))
     assert re.search(r"centre x +432\.0 ± 4\.4 +mm", text)
     assert re.search(r"centre x in plate +-18\.0 ± 4\.4 +mm", text)
     assert "Not identifiable with a σ: it is more than 10 % of the value" in text
     in_platform = weigh_report(found).centre_in_platform_m
     assert in_platform is not None
-    expected = [pytest.approx(-0.018), pytest.approx(0.03), None]
-    assert in_platform.value == expected
-    path = checkout / "configs/cells/demo.yaml"
-    serial = replace(found, cell=load_cell(path))
+    x, y, z = in_platform.value
+    assert x == pytest.approx(-0.018)
+    assert y == pytest.approx(0.03)
+    assert z is None
+
+    serial = replace(found, cell=_demo(checkout))
     assert weigh_report(serial).centre_in_platform_m is None
-    assert " in " not in _text(weighed_view(serial)).partition("In the frame")[0]
+    serial_text = _text(weighed_view(serial))
+    before_frame = serial_text.partition("In the frame")[0]
+    assert " in " not in before_frame
 
 
 def test_a_platform_that_only_translates_shows_a_mass_alone(checkout: Path) -> None:
-    cell = load_cell(checkout / "configs/cells/five-bar.yaml")
-    ten = np.array([np.nan] * 9 + [5.0])
-    covariance = np.diag(np.where(np.isnan(ten), np.nan, 0.02) ** 2)
-    axes = (2.0,) * 2
-    error = RelativeError(axes, 2.0)
-    body = WeighedBody(ten, covariance, covariance, True, 20, error, Scale.__new__(Scale))
-    logs = (Path("a.mcap"),)
-    weighed = Weighed(cell, logs, (), body, (), 5.0)
-    parts = weighed_view(weighed)
-    lines = _text(parts).splitlines()
+    ten = np.full(10, np.nan)
+    ten[9] = 5.0
+    std = np.where(np.isnan(ten), np.nan, 0.02)
+    weighed = _weighed(_five_bar(checkout), ten, std)
+    lines = _text(weighed_view(weighed)).splitlines()
     assert lines[0].strip() == "Body on the platform"
     assert "The platform does not turn in these moves: centre and inertia cannot be seen." in lines
-    assert not any(line.startswith(("centre", "Ixx", "parameter")) for line in lines)
+    for line in lines:
+        assert not line.startswith(("centre", "Ixx", "parameter"))
+
+
+def _band(threshold: FloatArray, correlation_s: FloatArray, quiet_s: FloatArray) -> Band:
+    """A band of ±2 Nm on six axes."""
+    one = np.ones(6)
+    knots = np.ones((6, 4))
+    return Band(knots, 2.0 * one, threshold, correlation_s, quiet_s, 1.0)
 
 
 def test_contacts_are_listed(checkout: Path) -> None:
-    cell = load_cell(checkout / "configs/cells/demo.yaml")
+    cell = _demo(checkout)
     one = np.ones(6)
     even = np.ones((6, 500))
-    threshold = np.array([5.0] * 5 + [np.nan])
-    correlation_s = 0.05 * one
-    quiet_s = 40.0 * one
-    band = Band(np.ones((6, 4)), 2.0 * one, threshold, correlation_s, quiet_s, 1.0)
+    threshold = np.full(6, 5.0)
+    threshold[5] = np.nan
+    band = _band(threshold, 0.05 * one, 40.0 * one)
     torque = 0.5 * even
     torque[2, 100:140] = -9.0
     time_s = np.linspace(0.0, 9.98, 500)
@@ -271,20 +312,23 @@ def test_contacts_are_listed(checkout: Path) -> None:
     assert "J6 not judged: 40 s of quiet motion have too few separate peaks; record longer." in text
     report = contact_report(found, cell, Path("a.mcap"), None)
     (contact,) = report.contacts
-    expected = ("J3", -9.0, 1.8)
-    assert (contact.axis, contact.peak, contact.peak_over_threshold) == expected
-    assert (contact.start_s, contact.end_s) == pytest.approx((2.0, 2.78))
-    assert [one.axis for one in report.not_judged] == ["J6"]
+    assert contact.axis == "J3"
+    assert contact.peak == -9.0
+    assert contact.peak_over_threshold == 1.8
+    assert contact.start_s == pytest.approx(2.0)
+    assert contact.end_s == pytest.approx(2.78)
+    (not_judged,) = report.not_judged
+    assert not_judged.axis == "J6"
 
 
 def test_no_contact_is_said_of_judged_axes_alone(checkout: Path) -> None:
-    cell = load_cell(checkout / "configs/cells/demo.yaml")
+    cell = _demo(checkout)
     one = np.ones(6)
     even = np.ones((6, 500))
     threshold = np.array([5.0, np.nan, np.nan, 5.0, 5.0, 5.0])
     correlation_s = np.where(np.arange(6) == 1, 1.5, 0.02)
     quiet_s = np.array([40.0, 11.0, 8.0, 40.0, 40.0, 40.0])
-    band = Band(np.ones((6, 4)), 2.0 * one, threshold, correlation_s, quiet_s, 1.0)
+    band = _band(threshold, correlation_s, quiet_s)
     use = even > 0.0
     use[3] = False
     time_s = np.linspace(0.0, 9.98, 500)
@@ -294,12 +338,12 @@ def test_no_contact_is_said_of_judged_axes_alone(checkout: Path) -> None:
     assert "J2 not judged: its residual stays on one side for 1.5 s at a time" in text
     assert "J3 not judged: 8 s of quiet motion have too few separate peaks; record longer." in text
     assert "J4 not judged: it does not move in this log." in text
-    listed = contact_report(found, cell, Path("a.mcap"), None).not_judged
-    assert [entry.axis for entry in listed] == ["J2", "J3", "J4"]
-    zero_use = np.zeros_like(use)
-    blind = replace(found, use=zero_use)
-    parts = contact_view(blind, cell)
-    assert "No contact" not in _text(parts)
-    changed_band = replace(band, threshold=5.0 * one)
-    judged = replace(found, use=even > 0.0, band=changed_band)
+    report = contact_report(found, cell, Path("a.mcap"), None)
+    not_judged = [entry.axis for entry in report.not_judged]
+    assert not_judged == ["J2", "J3", "J4"]
+    no_use = np.zeros_like(use)
+    blind = replace(found, use=no_use)
+    assert "No contact" not in _text(contact_view(blind, cell))
+    known_band = replace(band, threshold=5.0 * one)
+    judged = replace(found, use=even > 0.0, band=known_band)
     assert "No contact.\n" in _text(contact_view(judged, cell))

@@ -70,7 +70,9 @@ from tests.daq.drives import (
 )
 
 NOW = datetime(2025, 1, 2, 3, 4, 5, tzinfo=UTC)
+GAIN = ObjectEntry(0x2003, 1, 32, signed=True)
 IN_DRIVES = pytest.approx(NAMEPLATE)
+NEW = pytest.approx(IDENTIFIED)
 NEW = pytest.approx(IDENTIFIED)
 WRITERS = multiprocessing.get_context("forkserver")
 WRITERS.set_forkserver_preload([__name__])
@@ -97,7 +99,8 @@ def _propose(
     request = Request(
         calibration or demo_calibration(), NOW, accepts_changed_configuration=True, base=base
     )
-    return propose(DriveTarget(cell, network), request)
+    target = DriveTarget(cell, network)
+    return propose(target, request)
 
 
 def _apply(
@@ -139,6 +142,36 @@ def _saved(simulation: SimulatedCell) -> list[float]:
     return [saved_gain(node) for node in simulation.nodes]
 
 
+def _first_written(count: int) -> object:
+    """Gains of the drives where only the first ones are identified, to compare with."""
+    written = IDENTIFIED[:count]
+    left = NAMEPLATE[count:]
+    return pytest.approx([*written, *left])
+
+
+def _enter_in_j5(network: CanopenNetwork, word: int) -> None:
+    """Write the gain of J5 as someone else does."""
+    objects = network.link.objects(5)
+    objects.write(GAIN, word)
+
+
+def _roll_back(cell: Cell, network: CanopenNetwork, audit: Path) -> None:
+    target = DriveTarget(cell, network)
+    rollback(target, NOW, audit=audit, who="T")
+
+
+def _acknowledge_gearbox(cell: Cell) -> None:
+    """Something under the name of a cell, without which there is nothing to rename."""
+    ledger = Ledger.of(cell)
+    assert ledger is not None
+    acknowledge(ledger, "J1", since=NOW, at=NOW, who="T", why="new gearbox")
+
+
+def _rename_demo(ledger: Ledger, at: datetime = NOW) -> None:
+    planned = plan_rename(ledger, "demo")
+    rename_cell(ledger, planned, who="T", at=at)
+
+
 def test_gains_are_written_read_back_and_saved(
     address: BusAddress, listener: Listener, tmp_path: Path
 ) -> None:
@@ -146,7 +179,8 @@ def test_gains_are_written_read_back_and_saved(
     with simulated(address) as simulation:
         before = [node.saved for node in simulation.nodes]
         written = _write(cell, address)
-        assert [change.parameter.value(change.new) / 1000.0 for change in written.parameters] == NEW
+        new_gains = [change.parameter.value(change.new) / 1000.0 for change in written.parameters]
+        assert new_gains == NEW
         assert all(change.saved for change in written.parameters)
         assert _gains(simulation) == NEW
         # A drive that loses its power comes back with what it saved: the gain, and the mapping of
@@ -158,7 +192,8 @@ def test_gains_are_written_read_back_and_saved(
         expected = [stored.pdos for stored in before]
         assert pdos == expected
     nodes = [node for node, *_ in listener.downloads()]
-    assert nodes == [1, 2, 3, 4, 5, 6] * 2
+    once = [1, 2, 3, 4, 5, 6]
+    assert nodes == once + once
 
 
 def test_nothing_but_the_gain_and_the_save_is_ever_sent(
@@ -169,16 +204,19 @@ def test_nothing_but_the_gain_and_the_save_is_ever_sent(
         listener.frames()
         _write(demo_cell(tmp_path), address)
     heard = listener.frames()
-    ours = [
-        frame
-        for frame in heard
-        if not 0x580 < frame.arbitration_id < 0x600 and frame.arbitration_id < 0x700
-    ]
-    expected = set(range(0x601, 0x607))
-    assert {frame.arbitration_id for frame in ours} == expected
-    written = {
-        int.from_bytes(frame.data[1:3], "little") for frame in ours if frame.data[0] >> 5 == 1
-    }
+    identifiers = set()
+    written = set()
+    for frame in heard:
+        is_answer = 0x580 < frame.arbitration_id < 0x600
+        is_heartbeat = frame.arbitration_id >= 0x700
+        if is_answer or is_heartbeat:
+            continue
+        identifiers.add(frame.arbitration_id)
+        is_download = frame.data[0] >> 5 == 1
+        if is_download:
+            index = int.from_bytes(frame.data[1:3], "little")
+            written.add(index)
+    assert identifiers == {0x601, 0x602, 0x603, 0x604, 0x605, 0x606}
     assert written == {0x2003, 0x1010}
     assert CONTROLWORD.index not in written
 
@@ -198,14 +236,15 @@ def test_a_dry_run_writes_nothing(address: BusAddress, listener: Listener, tmp_p
 
 def test_a_real_object_and_another_sign_and_unit(address: BusAddress, tmp_path: Path) -> None:
     negative = replace(REAL, factor=-0.5)
-    cell = demo_cell(tmp_path, *(negative if axis == "J4" else REAL for axis in AXES))
-    entered = (*NAMEPLATE[:3], 5.76, *NAMEPLATE[4:])
-    with simulated(address, entered=entered) as simulation:
+    cell = demo_cell(tmp_path, REAL, REAL, REAL, negative, REAL, REAL)
+    entered = list(NAMEPLATE)
+    entered[3] = 5.76
+    with simulated(address, entered=tuple(entered)) as simulation:
         written = _write(cell, address)
-        node = simulation.nodes[3]
-        assert entered_gain(node, REAL) == pytest.approx(4.605, rel=1e-6)
-        first_node = simulation.nodes[0]
-        assert entered_gain(first_node, REAL) == pytest.approx(33.9, rel=1e-6)
+        gain_of_j4 = entered_gain(simulation.nodes[3], REAL)
+        gain_of_j1 = entered_gain(simulation.nodes[0], REAL)
+        assert gain_of_j4 == pytest.approx(4.605, rel=1e-6)
+        assert gain_of_j1 == pytest.approx(33.9, rel=1e-6)
     parameter = written.parameters[0].parameter
     assert parameter.kind is ParameterKind.F32
 
@@ -227,17 +266,19 @@ def test_an_axis_with_power_is_refused_and_nothing_is_written(
     address: BusAddress, listener: Listener, tmp_path: Path, axis: int
 ) -> None:
     cell = demo_cell(tmp_path)
+    number = axis + 1
     with simulated(address) as simulation:
         with network_of(cell, address) as network:
             proposal = _propose(cell, network)
+            objects = network.link.objects(number)
             for command in (0x06, 0x07, 0x0F):
-                network.link.objects(axis + 1).write(CONTROLWORD, command)
+                objects.write(CONTROLWORD, command)
         listener.frames()
         with (
             network_of(cell, address) as network,
             pytest.raises(
                 ParameterRefused,
-                match=rf"J{axis + 1} \(node {axis + 1}\): "
+                match=rf"J{number} \(node {number}\): "
                 r"OPERATION ENABLED",
             ),
         ):
@@ -265,9 +306,10 @@ def test_power_that_comes_midway_ends_it_and_the_rest_is_put_back(
             r"\(node 2\)",
         ):
             _write(cell, address)
-        assert _gains(simulation)[0] == pytest.approx(NAMEPLATE[0])
-        assert _gains(simulation)[1] == pytest.approx(IDENTIFIED[1])
-        assert _gains(simulation)[2:] == pytest.approx(NAMEPLATE[2:])
+        first, second, *others = _gains(simulation)
+        assert first == pytest.approx(NAMEPLATE[0])
+        assert second == pytest.approx(IDENTIFIED[1])
+        assert others == pytest.approx(NAMEPLATE[2:])
         assert _saved(simulation) == IN_DRIVES
 
 
@@ -301,9 +343,11 @@ def test_an_abort_on_axis_3_puts_the_old_values_back_and_saves_them(
             r"(2003h:01|1010h:01): aborted",
         ) as caught:
             _write(cell, address)
-        restored = AXES if kind is FaultKind.REFUSES_SAVE else AXES[:3]
-        expected = [f"kept: the previous values are restored in {', '.join(restored)}"]
-        assert caught.value.__notes__ == expected
+        names = ", ".join(AXES[:3])
+        if kind is FaultKind.REFUSES_SAVE:
+            names = ", ".join(AXES)
+        notes = caught.value.__notes__
+        assert notes == [f"kept: the previous values are restored in {names}"]
         assert _gains(simulation) == IN_DRIVES
         assert _saved(simulation) == IN_DRIVES
 
@@ -330,7 +374,9 @@ def test_a_drive_that_falls_silent_is_named_and_the_others_are_put_back(
             _write(cell, address)
         assert caught.value.restored == ("J1", "J2")
         assert isinstance(caught.value.__cause__, ObjectAccessError)
-        assert _gains(simulation) == pytest.approx([*NAMEPLATE[:2], IDENTIFIED[2], *NAMEPLATE[3:]])
+        third_written = list(NAMEPLATE)
+        third_written[2] = IDENTIFIED[2]
+        assert _gains(simulation) == pytest.approx(third_written)
         # It comes back, and the record leads back.
         simulation.nodes[2].nmt = NmtState.OPERATIONAL
         monkeypatch.undo()
@@ -351,13 +397,14 @@ def test_whichever_transfer_fails_the_old_values_stay_everywhere(
     Of three drives: the first, one in between and the last; the others are on the bus and left
     alone.
     """
-    whole = demo_cell(tmp_path)
+    every_axis = demo_cell(tmp_path)
     count = 3
     left = 0
     objects = (WHOLE,) * count
     controller = Controller(objects=objects)
-    cell = replace(whole, axes=whole.axes[:count], controller=controller)
-    changed = pytest.approx([*IDENTIFIED[:count], *NAMEPLATE[count:]])
+    axes = every_axis.axes[:count]
+    cell = replace(every_axis, axes=axes, controller=controller)
+    changed = _first_written(count)
 
     def failing(transfer: Callable[..., int | None]) -> Callable[..., int | None]:
         def tried(access: ObjectAccess, entry: ObjectEntry, *value: int) -> int | None:
@@ -414,10 +461,12 @@ def test_a_foreign_master_that_comes_midway_ends_it(
 ) -> None:
     cell = demo_cell(tmp_path)
 
+    device_type = ObjectEntry(0x1000, 0, 32, signed=False)
+
     def greet(access: ObjectAccess) -> None:
         if access.node_id == 3:
             with network_of(cell, address) as other:
-                other.link.objects(1).read(ObjectEntry(0x1000, 0, 32, signed=False))
+                other.link.objects(1).read(device_type)
 
     _after_gain(monkeypatch, greet)
     with simulated(address) as simulation:
@@ -430,7 +479,8 @@ def test_a_foreign_master_that_comes_midway_ends_it(
 def test_another_drive_is_refused(address: BusAddress, tmp_path: Path) -> None:
     cell = demo_cell(tmp_path)
     faulty = simulated(address, FaultSpec(FaultKind.OTHER_SERIAL, 5))
-    with faulty, network_of(cell, address) as network, pytest.raises(SetupRefused, match="node 6"):
+    refused = pytest.raises(SetupRefused, match="node 6")
+    with faulty, network_of(cell, address) as network, refused:
         _propose(cell, network)
 
 
@@ -439,10 +489,13 @@ def test_a_drive_that_keeps_something_else_is_found(
 ) -> None:
     write = ObjectAccess.write
     cell = demo_cell(tmp_path)
+    gain_of_j4 = 2**32 - 9210
 
     def rounding(access: ObjectAccess, entry: ObjectEntry, value: int) -> None:
-        rounds = entry.index == 0x2003 and access.node_id == 4 and value == 2**32 - 9210
-        write(access, entry, value + rounds)
+        is_gain = entry.index == 0x2003 and access.node_id == 4
+        if is_gain and value == gain_of_j4:
+            value += 1
+        write(access, entry, value)
 
     monkeypatch.setattr(ObjectAccess, "write", rounding)
     with simulated(address) as simulation:
@@ -497,7 +550,8 @@ def test_a_drive_that_still_waits_for_a_recorder_is_not_saved(
     with simulated(address) as simulation, network_of(cell, address) as network:
         proposal = _propose(cell, network)
         consumer = ObjectEntry(0x1016, 1, 32, signed=False)
-        network.link.objects(2).write(consumer, recorder_id << 16 | 500)
+        awaited = recorder_id << 16 | 500
+        network.link.objects(2).write(consumer, awaited)
         with pytest.raises(
             ParameterRefused,
             match=rf"J2 \(node 2\): .*1016h:01 = 00{recorder_id:02X}01F4h "
@@ -527,9 +581,11 @@ def test_a_save_of_which_nothing_is_known_is_refused_unless_asked_for(
 def test_a_profile_without_a_save_is_refused(address: BusAddress, tmp_path: Path) -> None:
     cell = demo_cell(tmp_path)
     with simulated(address) as simulation, network_of(cell, address) as network:
-        network.axes = tuple(
-            replace(axis, profile=replace(axis.profile, save=None)) for axis in network.axes
-        )
+        axes = []
+        for axis in network.axes:
+            without_save = replace(axis.profile, save=None)
+            axes.append(replace(axis, profile=without_save))
+        network.axes = tuple(axes)
         proposal = _propose(cell, network)
         target = DriveTarget(cell, network, Saving.ANY)
         with pytest.raises(ParameterRefused, match="is not described in its profile"):
@@ -542,8 +598,9 @@ def test_the_gates_are_those_of_a_file(
 ) -> None:
     cell = demo_cell(tmp_path)
     calibration = demo_calibration()
-    gains = (replace(calibration.gains[0], value=60.0), *calibration.gains[1:])
-    far = replace(calibration, gains=gains)
+    first, *others = calibration.gains
+    far_gain = replace(first, value=60.0)
+    far = replace(calibration, gains=(far_gain, *others))
     with simulated(address), network_of(cell, address) as network:
         base = "0" * 64
         proposal = _propose(cell, network, far, base=base)
@@ -557,8 +614,9 @@ def test_the_gates_are_those_of_a_file(
         audit = tmp_path / "audit"
         with pytest.raises(CalibrationRefused, match="3 failed checks"):
             _apply(proposal, target, audit)
-        changed_gain = replace(calibration.gains[5], axis="J9")
-        strange = replace(calibration, gains=(*calibration.gains[:5], changed_gain))
+        *first_five, last = calibration.gains
+        other_axis = replace(last, axis="J9")
+        strange = replace(calibration, gains=(*first_five, other_axis))
         with pytest.raises(CalibrationRefused, match="one for each axis of the cell"):
             _propose(cell, network, strange)
         nowhere = replace(cell, controller=None)
@@ -595,15 +653,16 @@ def test_an_object_that_cannot_hold_the_gain_is_refused(
     address: BusAddress, tmp_path: Path, gain_object: GainObject, says: str
 ) -> None:
     calibration = demo_calibration()
-    changed_gain = replace(calibration.gains[0], value=33.7, std=0.135)
-    gains = (changed_gain, *calibration.gains[1:])
+    first, *others = calibration.gains
+    changed_gain = replace(first, value=33.7, std=0.135)
+    changed = replace(calibration, gains=(changed_gain, *others))
     cell = demo_cell(tmp_path, *(gain_object,) * 6)
     with (
         simulated(address),
         network_of(cell, address) as network,
         pytest.raises(ControllerUnfit) as caught,
     ):
-        _propose(cell, network, replace(calibration, gains=gains))
+        _propose(cell, network, changed)
     assert says in str(caught.value)
 
 
@@ -613,7 +672,7 @@ def test_a_drive_that_someone_changed_since_the_dry_run_is_refused(
     cell = demo_cell(tmp_path)
     with simulated(address) as simulation, network_of(cell, address) as network:
         proposal = _propose(cell, network)
-        network.link.objects(5).write(ObjectEntry(0x2003, 1, 32, signed=True), 18000)
+        _enter_in_j5(network, 18000)
         with pytest.raises(ControllerChanged, match="take a new dry run"):
             _apply(proposal, DriveTarget(cell, network))
         assert _gains(simulation)[4] == 18.0
@@ -626,38 +685,22 @@ def test_back_and_forth(address: BusAddress, tmp_path: Path) -> None:
     with simulated(address) as simulation:
         written = _write(cell, address)
         record = read_record(_backup(written))
-        assert [(note.axis, note.serial, note.old, note.new) for note in record.drives][:2] == [
-            ("J1", 1001, 32960, 33900),
-            ("J2", 1002, 32960, 32400),
-        ]
-        for minutes, expected, saved in (
-            (1, IN_DRIVES, IN_DRIVES),
-            (2, NEW, NEW),
-            (2, IN_DRIVES, IN_DRIVES),
-        ):
+        first, second, *_ = record.drives
+        assert (first.axis, first.serial, first.old, first.new) == ("J1", 1001, 32960, 33900)
+        assert (second.axis, second.serial, second.old, second.new) == ("J2", 1002, 32960, 32400)
+        for minutes, expected in ((1, IN_DRIVES), (2, NEW), (2, IN_DRIVES)):
             with network_of(cell, address) as network:
                 now = NOW + timedelta(minutes=minutes)
                 target = DriveTarget(cell, network)
-                rollback(
-                    target,
-                    now,
-                    audit=cell.history.audit,
-                    who="T",
-                )
+                rollback(target, now, audit=cell.history.audit, who="T")
             assert _gains(simulation) == expected
-            assert _saved(simulation) == saved
+            assert _saved(simulation) == expected
     records = read_records(record_folder(cell))
     assert len(records) == 4
     actions = [entry.action for entry in read(cell.history.audit)]
-    assert (
-        actions
-        == [AuditAction.APPLY_BEGUN, AuditAction.APPLIED, AuditAction.CALIBRATION_ENTERED]
-        + [
-            AuditAction.ROLLBACK_BEGUN,
-            AuditAction.ROLLED_BACK,
-        ]
-        * 3
-    )
+    write = [AuditAction.APPLY_BEGUN, AuditAction.APPLIED, AuditAction.CALIBRATION_ENTERED]
+    way_back = [AuditAction.ROLLBACK_BEGUN, AuditAction.ROLLED_BACK]
+    assert actions == write + 3 * way_back
     assert verify(cell.history.audit).open_writes == ()
 
 
@@ -678,12 +721,10 @@ def test_a_write_under_the_old_name_of_a_renamed_cell_is_rolled_back(
                 r"drives of the cell that is called 'press' now",
             ),
         ):
-            rollback(DriveTarget(press, network), NOW, audit=ledger.audit, who="T")
-        planned = plan_rename(ledger, "demo")
-        rename_cell(ledger, planned, who="T", at=NOW)
+            _roll_back(press, network, ledger.audit)
+        _rename_demo(ledger)
         with network_of(press, address) as network:
-            target = DriveTarget(press, network)
-            rollback(target, NOW, audit=ledger.audit, who="T")
+            _roll_back(press, network, ledger.audit)
         assert _gains(simulation) == IN_DRIVES
     events = read_history(ledger).events
     targets = [event.target for event in events]
@@ -696,8 +737,8 @@ def test_the_old_file_of_a_renamed_cell_writes_nothing(address: BusAddress, tmp_
     press = replace(demo, name="press")
     ledger = Ledger.of(press)
     assert ledger is not None
-    acknowledge(Ledger.of(demo) or ledger, "J1", since=NOW, at=NOW, who="T", why="new gearbox")
-    rename_cell(ledger, plan_rename(ledger, "demo"), who="T", at=NOW)
+    _acknowledge_gearbox(demo)
+    _rename_demo(ledger)
     with simulated(address) as simulation, network_of(demo, address) as network:
         before = _gains(simulation)
         proposal = _propose(demo, network)
@@ -721,30 +762,30 @@ def test_a_record_belongs_to_the_cell_that_had_its_name_at_that_time(
     ledger = Ledger.of(press)
     assert ledger is not None
     renamed_at = NOW + timedelta(seconds=renamed_after_s)
-    # Something under the old name, without which there is nothing to rename.
-    acknowledge(Ledger.of(demo) or ledger, "J1", since=NOW, at=NOW, who="T", why="new gearbox")
+    _acknowledge_gearbox(demo)
     with simulated(address) as simulation:
         with network_of(demo, address) as network:
             proposal = _propose(demo, network)
         if renamed_after_s < 0:
-            planned = plan_rename(ledger, "demo")
-            rename_cell(ledger, planned, who="T", at=renamed_at)
+            _rename_demo(ledger, renamed_at)
         with network_of(demo, address) as network:
             _apply(proposal, DriveTarget(demo, network), ledger.audit)
         if renamed_after_s > 0:
-            rename = plan_rename(ledger, "demo")
-            rename_cell(ledger, rename, who="T", at=renamed_at)
+            _rename_demo(ledger, renamed_at)
         written = _gains(simulation)
-        owner, other = (demo, press) if renamed_after_s < 0 else (press, demo)
+        owner = press
+        other = demo
+        if renamed_after_s < 0:
+            owner = demo
+            other = press
         with (
             network_of(other, address) as network,
             pytest.raises(ControllerUnfit, match=f"expected .* called '{other.name}' now"),
         ):
-            rollback(DriveTarget(other, network), NOW, audit=ledger.audit, who="T")
+            _roll_back(other, network, ledger.audit)
         assert _gains(simulation) == written
         with network_of(owner, address) as network:
-            target = DriveTarget(owner, network)
-            rollback(target, NOW, audit=ledger.audit, who="T")
+            _roll_back(owner, network, ledger.audit)
         assert _gains(simulation) == IN_DRIVES
 
 
@@ -756,12 +797,12 @@ def test_a_rollback_that_would_lose_what_someone_did_is_refused(
         with pytest.raises(CalibrationRefused, match="no record"):
             rollback(DriveTarget(cell, network), NOW)
         written = _write(cell, address)
-        network.link.objects(5).write(ObjectEntry(0x2003, 1, 32, signed=True), 18000)
+        _enter_in_j5(network, 18000)
         with pytest.raises(
             ControllerChanged, match="found 18000; expected 16300 as drivegain wrote it, or 18480"
         ):
             rollback(DriveTarget(cell, network), NOW)
-        network.link.objects(5).write(ObjectEntry(0x2003, 1, 32, signed=True), 16300)
+        _enter_in_j5(network, 16300)
         body = json.loads(_backup(written).read_text())
         body["drives"][0]["old"] = 99999
         _backup(written).write_text(json.dumps(body))
@@ -780,39 +821,44 @@ def test_a_gain_that_someone_entered_in_a_drive_is_reviewed_first(
     that, or the one before it, is no surprise.
     """
     cell = demo_cell(tmp_path)
-    entry = ObjectEntry(0x2003, 1, 32, signed=True)
     with simulated(address), network_of(cell, address) as network:
         first = _propose(cell, network)
         assert first.refusals == ()  # no record: nothing to compare with
         written = _write(cell, address)
         for word in (16300, 18480):
-            network.link.objects(5).write(entry, word)
+            _enter_in_j5(network, word)
             assert _propose(cell, network).refusals == ()
-        network.link.objects(5).write(entry, 18000)
+        _enter_in_j5(network, 18000)
         changed = _propose(cell, network)
-        expected = [(Gate.BASE, "J5, 2003h:01", "18000")]
-        assert [(one.gate, one.subject, one.found) for one in changed.refusals] == expected
-        assert "16300" in changed.refusals[0].expected
-        refusals = _propose(cell, network, base=changed.edit.base_sha256).refusals
-        assert refusals == ()
-        gates = [one.gate for one in _propose(cell, network, base=first.edit.base_sha256).refusals]
+        (refusal,) = changed.refusals
+        assert refusal.gate is Gate.BASE
+        assert refusal.subject == "J5, 2003h:01"
+        assert refusal.found == "18000"
+        assert "16300" in refusal.expected
+        reviewed = _propose(cell, network, base=changed.edit.base_sha256)
+        assert reviewed.refusals == ()
+        of_first = _propose(cell, network, base=first.edit.base_sha256)
+        gates = [refusal.gate for refusal in of_first.refusals]
         assert gates == [Gate.BASE]
-        network.link.objects(5).write(entry, 16300)
-        _backup(written).write_text("{}")
+
+        _enter_in_j5(network, 16300)
+        backup = _backup(written)
+        backup.write_text("{}")
         unread = _propose(cell, network)
-        assert [(one.gate, one.subject) for one in unread.refusals] == [
-            (Gate.BASE, str(_backup(written)))
-        ]
-        assert _propose(cell, network, base=unread.edit.base_sha256).refusals == ()
+        (refusal,) = unread.refusals
+        assert refusal.gate is Gate.BASE
+        assert refusal.subject == str(backup)
+        reviewed = _propose(cell, network, base=unread.edit.base_sha256)
+        assert reviewed.refusals == ()
 
 
 def test_an_exchanged_drive_gets_no_old_gain(address: BusAddress, tmp_path: Path) -> None:
     cell = demo_cell(tmp_path)
     with simulated(address):
         _write(cell, address)
-    changed_axis = replace(cell.axes[0], identity=None)
-    axes = (changed_axis, *cell.axes[1:])
-    new = replace(cell, axes=axes)
+    first, *others = cell.axes
+    exchanged = replace(first, identity=None)
+    new = replace(cell, axes=(exchanged, *others))
     fault_spec = FaultSpec(FaultKind.OTHER_SERIAL, 0)
     with simulated(address, fault_spec, entered=IDENTIFIED) as simulation:
         with (
@@ -831,17 +877,16 @@ def test_after_a_kill_the_record_says_what_was_there_and_leads_back(
     cell = demo_cell(tmp_path)
     assert cell.history is not None
     with Hub(("can0",)) as hub, simulated(hub.address()) as simulation:
-        process = WRITERS.Process(
-            target=_write_until_killed, args=(tmp_path, hub.address(), writes)
-        )
+        arguments = (tmp_path, hub.address(), writes)
+        process = WRITERS.Process(target=_write_until_killed, args=arguments)
         process.start()
         process.join()
         assert process.exitcode == -signal.SIGKILL
-        changed = min(writes, 6)
-        assert _gains(simulation) == pytest.approx([*IDENTIFIED[:changed], *NAMEPLATE[changed:]])
+        assert _gains(simulation) == _first_written(min(writes, 6))
         (path,) = read_records(record_folder(cell))
         drives = read_record(path).drives
-        assert [note.parameter.value(note.old) / 1000.0 for note in drives] == IN_DRIVES
+        old_gains = [note.parameter.value(note.old) / 1000.0 for note in drives]
+        assert old_gains == IN_DRIVES
         (left,) = verify(cell.history.audit).open_writes
         assert left.begun.action is AuditAction.APPLY_BEGUN
         with network_of(cell, hub.address()) as network:

@@ -33,6 +33,8 @@ from tests.drivers.scripted import FakeClock
 LEFT = frozenset((1, 3, 5))
 RIGHT = frozenset((2, 4, 6))
 NAMES = ("left", "right")
+NODES = {"left": LEFT, "right": RIGHT}
+SYNC = 0x080
 
 
 class Wire(can.BusABC):
@@ -46,7 +48,8 @@ class Wire(can.BusABC):
         self.log = log
         self.clock = clock
         self.coming: deque[can.Message] = deque()
-        self.broken = self.stuck = False
+        self.broken = False
+        self.stuck = False
         self.asked_s: list[float] = []
         self.closed = 0
         self.losses = Losses()
@@ -63,10 +66,11 @@ class Wire(can.BusABC):
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
         self._check()
-        self.asked_s.append(0.0 if timeout is None else timeout)
+        timeout_s = timeout or 0.0
+        self.asked_s.append(timeout_s)
         if self.coming:
             return self.coming.popleft()
-        self.clock.now_ns += round((timeout or 0.0) * 1e9)
+        self.clock.now_ns += round(timeout_s * 1e9)
         return None
 
     def shutdown(self) -> None:
@@ -82,38 +86,49 @@ class Pair:
     def __init__(self) -> None:
         self.clock = FakeClock()
         self.log: list[tuple[str, int]] = []
-        self.left, self.right = (Wire(name, self.log, self.clock) for name in NAMES)
-        parts = tuple(
-            BusPart(name, BusAddress("scripted", name), nodes, {1: "J1"})
-            for name, nodes in zip(NAMES, (LEFT, RIGHT), strict=True)
-        )
-        self.address = SplitAddress(parts)
+        self.left = Wire("left", self.log, self.clock)
+        self.right = Wire("right", self.log, self.clock)
+        self.address = SplitAddress((self._part("left"), self._part("right")))
         ends = (self.left, self.right)
-        self.bus = SplitBus(self.address, ends, lambda: self.clock.now_ns * 1e-9)
+        self.bus = SplitBus(self.address, ends, self._now_s)
+
+    def _part(self, name: str) -> BusPart:
+        address = BusAddress("scripted", name)
+        return BusPart(name, address, NODES[name], {1: "J1"})
+
+    def _now_s(self) -> float:
+        return self.clock.now_ns * 1e-9
 
 
 @pytest.fixture
 def pair() -> Iterator[Pair]:
     made = Pair()
     yield made
-    made.left.stuck = made.right.stuck = False
+    made.left.stuck = False
+    made.right.stuck = False
     made.bus.shutdown()
 
 
 def frame(identifier: int, at_s: float = 0.0, data: bytes = b"", **more: bool) -> can.Message:
-    return can.Message(
-        timestamp=at_s, arbitration_id=identifier, data=data, **{"is_extended_id": False, **more}
-    )
+    kind = {"is_extended_id": False} | more
+    return can.Message(timestamp=at_s, arbitration_id=identifier, data=data, **kind)
+
+
+def setpoints_and_sync() -> list[can.Message]:
+    """The burst of a cycle: a set-point for each of six nodes, and the SYNC."""
+    burst = [frame(0x200 + node) for node in range(1, 7)]
+    burst.append(frame(SYNC))
+    return burst
 
 
 class FarEnd(SplitBus):
     """The other ends of the wires; a frame that arrives on all of them counts once."""
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
+        first = str(self.address.parts[0])
         while (message := super().recv(timeout)) is not None:
-            if len(self.address.route(message)) == 1 or message.channel == str(
-                self.address.parts[0]
-            ):
+            is_of_one_bus = len(self.address.route(message)) == 1
+            if is_of_one_bus or message.channel == first:
                 return message
         return None
 
@@ -124,11 +139,13 @@ def _split(kind: type[SplitBus], address: SplitAddress) -> SplitBus:
 
 def _three(one: BusAddress, other: BusAddress) -> Iterator[Ends]:
     low = frozenset(range(1, 64))
-    node_ids = frozenset(range(64, 128))
-    bus_part = BusPart("low", one, low)
-    parts = (bus_part, BusPart("high", other, node_ids))
+    high = frozenset(range(64, 128))
+    parts = (BusPart("low", one, low), BusPart("high", other, high))
     address = SplitAddress(parts)
-    ends = _split(SplitBus, address), _split(FarEnd, address), _split(FarEnd, address)
+    near = _split(SplitBus, address)
+    far = _split(FarEnd, address)
+    further = _split(FarEnd, address)
+    ends = (near, far, further)
     try:
         yield ends
     finally:
@@ -140,9 +157,9 @@ class TestSplitVirtual(BusContract):
     @pytest.fixture
     def ends(self, request: pytest.FixtureRequest) -> Iterator[Ends]:
         name = request.node.nodeid
-        channel = name + "-low"
-        bus_address = BusAddress("virtual", name + "-high")
-        yield from _three(BusAddress("virtual", channel), bus_address)
+        low = BusAddress("virtual", f"{name}-low")
+        high = BusAddress("virtual", f"{name}-high")
+        yield from _three(low, high)
 
 
 def test_every_frame_goes_to_the_bus_of_its_node(pair: Pair) -> None:
@@ -151,7 +168,7 @@ def test_every_frame_goes_to_the_bus_of_its_node(pair: Pair) -> None:
         for node_id, name in ((1, "left"), (2, "right")):
             identifier = service + node_id
             pair.bus.send(frame(identifier))
-            expected.append((name, service + node_id))
+            expected.append((name, identifier))
     for node_id, name in ((1, "left"), (2, "right")):
         data = bytes((NmtCommand.START, node_id))
         pair.bus.send(frame(0x000, data=data))
@@ -160,25 +177,31 @@ def test_every_frame_goes_to_the_bus_of_its_node(pair: Pair) -> None:
 
 
 def test_what_concerns_everybody_goes_to_all(pair: Pair) -> None:
+    stop_all = bytes((NmtCommand.STOP, 0))
     for message in (
-        frame(0x080),
-        frame(0x000, data=bytes((NmtCommand.STOP, 0))),
+        frame(SYNC),
+        frame(0x000, data=stop_all),
         frame(0x77F, data=b"\5"),  # the recorder's heartbeat: its id is no node's
         frame(0x67D),  # a node with this id may be on either
         frame(0x12345, is_extended_id=True),
     ):
         pair.log.clear()
         pair.bus.send(message)
-        expected = [(name, message.arbitration_id) for name in NAMES]
-        assert pair.log == expected
+        identifier = message.arbitration_id
+        assert pair.log == [("left", identifier), ("right", identifier)]
 
 
 def test_the_syncs_of_a_burst_follow_each_other_behind_all_setpoints(pair: Pair) -> None:
-    messages = [*(frame(0x200 + node) for node in range(1, 7)), frame(0x080)]
-    send_burst(pair.bus, messages)
-    expected = [("left", 0x080), ("right", 0x080)]
-    assert pair.log[-2:] == expected
-    assert pair.log[:6] == [(NAMES[(node + 1) % 2], 0x200 + node) for node in range(1, 7)]
+    send_burst(pair.bus, setpoints_and_sync())
+    assert pair.log[-2:] == [("left", SYNC), ("right", SYNC)]
+    assert pair.log[:6] == [
+        ("left", 0x201),
+        ("right", 0x202),
+        ("left", 0x203),
+        ("right", 0x204),
+        ("left", 0x205),
+        ("right", 0x206),
+    ]
 
 
 @settings(deadline=None)
@@ -190,31 +213,35 @@ def test_received_frames_come_in_the_order_of_their_time_stamps(
     left: list[int], right: list[int]
 ) -> None:
     pair = Pair()
-    for wire, node, stamps in ((pair.left, 1, sorted(left)), (pair.right, 2, sorted(right))):
-        wire.coming.extend(
-            frame(0x180 + node, at_s, n.to_bytes(2, "big")) for n, at_s in enumerate(stamps)
-        )
-    received = []
+    for wire, identifier, stamps in ((pair.left, 0x181, left), (pair.right, 0x182, right)):
+        for number, at_s in enumerate(sorted(stamps)):
+            content = number.to_bytes(2, "big")
+            wire.coming.append(frame(identifier, at_s, content))
+    left_name, right_name = map(str, pair.address.parts)
+    names = {0x181: left_name, 0x182: right_name}
+    stamps_s = []
+    numbers: dict[int, list[int]] = {0x181: [], 0x182: []}
     while (message := pair.bus.recv(0.0)) is not None:
-        received.append(message)
-    expected = sorted([*left, *right])
-    assert [message.timestamp for message in received] == expected
-    for identifier, stamps in ((0x181, left), (0x182, right)):
-        numbers = [
-            int.from_bytes(m.data, "big") for m in received if m.arbitration_id == identifier
-        ]
-        assert numbers == list(range(len(stamps)))
-    names = dict(zip((0x181, 0x182), map(str, pair.address.parts), strict=True))
-    assert all(message.channel == names[message.arbitration_id] for message in received)
+        identifier = message.arbitration_id
+        assert message.channel == names[identifier]
+        stamps_s.append(message.timestamp)
+        number = int.from_bytes(message.data, "big")
+        numbers[identifier].append(number)
+    assert stamps_s == sorted([*left, *right])
+    assert numbers[0x181] == list(range(len(left)))
+    assert numbers[0x182] == list(range(len(right)))
     pair.bus.shutdown()
 
 
 def test_a_bus_whose_clock_lags_behind_does_not_silence_the_other(pair: Pair) -> None:
-    pair.left.coming.extend(frame(0x181, 0.0) for _ in range(1000))
+    for _ in range(1000):
+        pair.left.coming.append(frame(0x181, 0.0))
     pair.right.coming.append(frame(0x182, 100.0))
-    received = [pair.bus.recv(0.0) for _ in range(LARGEST_RUN + 1)]
-    assert received[-1] is not None
-    assert received[-1].arbitration_id == 0x182
+    received = None
+    for _ in range(LARGEST_RUN + 1):
+        received = pair.bus.recv(0.0)
+    assert received is not None
+    assert received.arbitration_id == 0x182
 
 
 def test_waiting_at_one_bus_never_lasts_while_the_other_may_have_frames(pair: Pair) -> None:
@@ -225,44 +252,43 @@ def test_waiting_at_one_bus_never_lasts_while_the_other_may_have_frames(pair: Pa
     assert elapsed_ns == pytest.approx(0.1e9, abs=1e6)
     largest_asked_s = max(pair.left.asked_s + pair.right.asked_s)
     assert largest_asked_s < 0.001
-    expected = sum(pair.right.asked_s)
-    assert sum(pair.left.asked_s) == pytest.approx(expected, abs=0.001)
+    at_left_s = sum(pair.left.asked_s)
+    at_right_s = sum(pair.right.asked_s)
+    assert at_left_s == pytest.approx(at_right_s, abs=0.001)
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_buses_with_file_descriptors_are_waited_for_together(name: str) -> None:
     with Hub(NAMES) as hub:
-        parts = tuple(
-            BusPart(part, hub.address(part), nodes)
-            for part, nodes in zip(NAMES, (LEFT, RIGHT), strict=True)
-        )
-        bus = open_cell_bus(SplitAddress(parts))
+        left = BusPart("left", hub.address("left"), LEFT)
+        right = BusPart("right", hub.address("right"), RIGHT)
+        bus = open_cell_bus(SplitAddress((left, right)))
         far = open_bus(hub.address(name))
         try:
             assert bus.recv(0.0) is None
             far.send(frame(0x201))
             heard = bus.recv(WAIT_S)
             assert heard is not None
-            expected = f"{name} ({hub.address(name)})"
-            assert heard.channel == expected
+            assert heard.channel == f"{name} ({hub.address(name)})"
         finally:
             bus.shutdown()
             far.shutdown()
 
 
 def test_a_foreign_sync_on_either_bus_is_foreign(pair: Pair) -> None:
+    policy = SdoPolicy()
     for wire in (pair.left, pair.right):
-        link = Link(pair.address, SdoPolicy(), pair.clock, lambda _address: pair.bus)
+        link = Link(pair.address, policy, pair.clock, lambda _address: pair.bus)
         link.open()
-        wire.coming.append(frame(0x080))
+        wire.coming.append(frame(SYNC))
         link.pump(0.0)
-        assert link.foreign == {0x080: 1}
+        assert link.foreign == {SYNC: 1}
 
 
 def test_our_own_sync_comes_back_once(pair: Pair) -> None:
     """SocketCAN gives it back for the sake of its time, on every bus."""
     for at_s, wire in ((1.0, pair.right), (1.1, pair.left)):
-        message = frame(0x080, at_s)
+        message = frame(SYNC, at_s)
         message.is_rx = False
         wire.coming.append(message)
     heard = pair.bus.recv(0.0)
@@ -285,12 +311,13 @@ class Hoarder(Wire):
 def test_frames_behind_one_that_is_left_out_are_not_waited_for(pair: Pair) -> None:
     one, other = socket.socketpair()
     with one, other:
-        ends = Hoarder("left", one), Hoarder("right", other)
-        bus = SplitBus(pair.address, ends)
-        echo = frame(0x080)
+        left = Hoarder("left", one)
+        right = Hoarder("right", other)
+        bus = SplitBus(pair.address, (left, right))
+        echo = frame(SYNC)
         echo.is_rx = False
-        coming = ends[1].coming
-        coming.extend((echo, frame(0x184)))
+        right.coming.append(echo)
+        right.coming.append(frame(0x184))
         assert bus.recv(0.0) is not None
         bus.shutdown()
 
@@ -303,44 +330,49 @@ def test_a_bus_that_fails_is_named_once_and_the_other_goes_on(
     if failing == "left":
         broken = pair.left
         sound = pair.right
+        identifier = 0x182
     else:
         broken = pair.right
         sound = pair.left
-    node_id = 2 if failing == "left" else 1
+        identifier = 0x181
     broken.broken = True
     pattern = rf"{failing} \(scripted:{failing}\): the wire was cut"
+    expected = []
     with pytest.raises(BusError, match=pattern):
-        pair.bus.send(frame(0x080)) if sending else pair.bus.recv(0.0)
-    expected = [(sound.name, 0x080)] if sending else []
+        if sending:
+            expected.append((sound.name, SYNC))
+            pair.bus.send(frame(SYNC))
+        else:
+            pair.bus.recv(0.0)
     assert pair.log == expected  # the others got it all the same
     pair.log.clear()
-    messages = [*(frame(0x200 + node) for node in range(1, 7)), frame(0x080)]
-    send_burst(pair.bus, messages)
-    assert {name for name, _ in pair.log} == {sound.name}
-    assert len(pair.log) == 4
-    identifier = 0x180 + node_id
+    send_burst(pair.bus, setpoints_and_sync())
+    names = [name for name, _ in pair.log]
+    assert names == [sound.name] * 4
     sound.coming.append(frame(identifier))
     assert pair.bus.recv(0.0) is not None
     sound.broken = True
     with pytest.raises(BusError, match=sound.name):
-        pair.bus.send(frame(0x080))
+        pair.bus.send(frame(SYNC))
     for _ in range(2):
         with pytest.raises(BusError, match="all of them have failed"):
-            pair.bus.send(frame(0x080))
+            pair.bus.send(frame(SYNC))
         with pytest.raises(BusError, match="all of them have failed"):
             pair.bus.recv(0.1)
 
 
 def test_a_controller_that_went_off_its_bus_is_named(pair: Pair) -> None:
-    pair.right.coming.append(frame(BUS_OFF, is_error_frame=True, data=bytes(8)))
+    bus_off = frame(BUS_OFF, is_error_frame=True, data=bytes(8))
+    pair.right.coming.append(bus_off)
     with pytest.raises(BusError, match=r"right \(scripted:right\): bus-off"):
         pair.bus.recv(0.0)
-    pair.bus.send(frame(0x080))
-    assert pair.log == [("left", 0x080)]
+    pair.bus.send(frame(SYNC))
+    assert pair.log == [("left", SYNC)]
 
 
 def test_a_node_on_the_other_bus_is_reported_once_and_not_believed(pair: Pair) -> None:
-    pair.right.coming.extend(frame(0x181, data=bytes(8)) for _ in range(3))
+    for _ in range(3):
+        pair.right.coming.append(frame(0x181, data=bytes(8)))
     pair.left.coming.append(frame(0x181, 1.0, b"mine"))
     with pytest.raises(
         NodeMisplaced,
@@ -372,13 +404,14 @@ def test_a_flood_of_frames_that_are_left_out_does_not_keep_the_reader(
 
 
 def test_one_node_id_on_two_buses_is_refused_before_anything_is_opened() -> None:
-    parts = tuple(
-        BusPart(name, BusAddress("carrier-pigeon", name), frozenset((3, 4))) for name in NAMES
-    )
+    parts = []
+    for name in NAMES:
+        address = BusAddress("carrier-pigeon", name)
+        parts.append(BusPart(name, address, frozenset((3, 4))))
     with pytest.raises(
         BusError, match="node 3 is on left and on right; give one of the two another"
     ):
-        open_cell_bus(SplitAddress(parts))
+        open_cell_bus(SplitAddress(tuple(parts)))
 
 
 def test_a_bus_that_cannot_be_opened_is_named_and_the_others_are_closed(
@@ -391,16 +424,13 @@ def test_a_bus_that_cannot_be_opened_is_named_and_the_others_are_closed(
         return opened[-1]
 
     monkeypatch.setattr("drivers.canopen.split_bus.open_bus", remember)
-    bus_address = BusAddress("virtual", "opened first")
-    bus_part = BusPart("left", bus_address, LEFT)
-    parts = (
-        bus_part,
-        BusPart("right", BusAddress("carrier-pigeon", "can1"), RIGHT),
-    )
+    left = BusPart("left", BusAddress("virtual", "opened first"), LEFT)
+    right = BusPart("right", BusAddress("carrier-pigeon", "can1"), RIGHT)
+    parts = (left, right)
     with pytest.raises(BusError, match=r"right \(carrier-pigeon:can1\)"):
         open_cell_bus(SplitAddress(parts))
     with pytest.raises(can.CanOperationError):
-        opened[0].send(frame(0x080))
+        opened[0].send(frame(SYNC))
 
 
 def test_closing_closes_all_although_one_fails(pair: Pair) -> None:
@@ -428,13 +458,15 @@ def test_frames_of_two_buses_come_in_the_order_of_the_monotonic_clock(
     """Also when the wall clock is set between them;
     its seconds as a float cannot resolve 100 ns.
     """
-    for number, wire in enumerate((pair.left, pair.right, pair.left, pair.right)):
+    wires = (pair.left, pair.right, pair.left, pair.right)
+    for number, wire in enumerate(wires):
         at_ns = 5_000_000_000 + 100 * number
-        timestamp = 1.7e9 + at_ns * 1e-9 + step_s * number
-        arbitration_id = 0x700 + number % 2 + 1
+        monotonic_s = at_ns * 1e-9
+        set_by_s = step_s * number
+        node_id = number % 2 + 1
         message = CapturedMessage(
-            timestamp=timestamp,
-            arbitration_id=arbitration_id,
+            timestamp=1.7e9 + monotonic_s + set_by_s,
+            arbitration_id=0x700 + node_id,
             is_extended_id=False,
             data=bytes((number,)),
         )
@@ -442,6 +474,7 @@ def test_frames_of_two_buses_come_in_the_order_of_the_monotonic_clock(
         message.monotonic_ns = at_ns
         message.local = False
         wire.coming.append(message)
-    got = [pair.bus.recv(0.0) for _ in range(4)]
-    expected = [0, 1, 2, 3]
-    assert [message.data[0] for message in got if message is not None] == expected
+    for number in range(4):
+        heard = pair.bus.recv(0.0)
+        assert heard is not None
+        assert heard.data[0] == number

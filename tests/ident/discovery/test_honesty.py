@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import combinations
 
 import numpy as np
 import pytest
@@ -30,6 +29,7 @@ from tests.ident.recordings import search_problem_of, with_current
 pytestmark = pytest.mark.slow
 
 FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
 GATES = Gates(draws=199)
 KNOWN = ("nonlinear-viscous", "load-friction")
 
@@ -47,8 +47,9 @@ def problem(small: Evidence) -> Linearisation:
     )
 
 
-def _fold_of_rows(folds: Folds) -> NDArray[np.int64]:
-    fold = np.empty(len(folds.linearisation.motor), dtype=np.int64)
+def _fold_of_rows(folds: Folds) -> IntArray:
+    row_count = len(folds.linearisation.motor)
+    fold = np.empty(row_count, dtype=np.int64)
     for rows, number, _, _ in folds.blocks:
         fold[rows] = number
     return fold
@@ -64,22 +65,39 @@ def _shows_its_own(folds: Folds, other: Folds) -> float:
 
 
 def _changed(problem: Linearisation, folds: Folds) -> Linearisation:
-    first = np.unique(folds.linearisation.cluster[_fold_of_rows(folds) == 0])
-    residual = problem.residual + 3.0 * np.isin(problem.cluster, first)
+    in_first_fold = _fold_of_rows(folds) == 0
+    clusters = folds.linearisation.cluster[in_first_fold]
+    is_changed = np.isin(problem.cluster, np.unique(clusters))
+    residual = problem.residual + 3.0 * is_changed
     return replace(problem, residual=residual)
 
 
 def test_a_held_out_fold_does_not_influence_its_own_prediction(problem: Linearisation) -> None:
     folds = cut_into_folds(problem)
     fold = _fold_of_rows(folds)
-    parts = [set(folds.linearisation.cluster[fold == number]) for number in range(folds.count)]
-    assert sum(map(len, parts)) == problem.cluster_count
-    assert not any(one & other for one, other in combinations(parts, 2))
+    every_cluster: set[int] = set()
+    for number in range(folds.count):
+        clusters = folds.linearisation.cluster[fold == number]
+        part = set(clusters.tolist())
+        assert not part & every_cluster
+        every_cluster |= part
+    assert len(every_cluster) == problem.cluster_count
+
     changed = cut_into_folds(_changed(problem, folds))
+
     change = changed.residual - folds.residual
     assert change[fold == 0] == pytest.approx(3.0)
     absolute_change = np.abs(change[fold != 0])
     assert np.max(absolute_change) > 1e-3
+
+
+def _fitted_on_all_rows(folds: Folds) -> Folds:
+    """Folds with the residual of one fit of all rows, which has seen what it predicts."""
+    linear = folds.linearisation
+    gradient = linear.jacobian.on_columns(linear.residual)
+    step = linalg.cho_solve(folds.full_factor, gradient)
+    residual = linear.residual - linear.jacobian @ step
+    return replace(folds, residual=np.asarray(residual))
 
 
 def test_a_planted_leak_is_seen(problem: Linearisation, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -90,30 +108,36 @@ def test_a_planted_leak_is_seen(problem: Linearisation, monkeypatch: pytest.Monk
     changed = cut_into_folds(_changed(problem, folds))
     assert _shows_its_own(folds, changed) == pytest.approx(3.0)
 
-    def of_all_rows(fold: Folds) -> FloatArray:
-        step = linalg.cho_solve(
-            fold.full_factor, fold.linearisation.jacobian.on_columns(fold.linearisation.residual)
-        )
-        return np.asarray(fold.linearisation.residual - fold.linearisation.jacobian @ step)
-
-    leaking = [replace(one, residual=of_all_rows(one)) for one in (folds, changed)]
-    assert _shows_its_own(*leaking) < 2.9
+    leaking = _fitted_on_all_rows(folds)
+    leaking_changed = _fitted_on_all_rows(changed)
+    assert _shows_its_own(leaking, leaking_changed) < 2.9
 
     # Pieces of one move dealt to different folds: they share its noise. The move's number is what
     # forbids it.
-    pieces = 4 * problem.cluster + np.arange(len(problem.cluster)) % 4
+    row = np.arange(len(problem.cluster))
+    pieces = 4 * problem.cluster + row % 4
     parted = replace(problem, cluster=pieces)
-    move_of = np.arange(4 * problem.cluster_count) // 4
-    kept = cut_into_folds(parted, move_of=move_of)
-    leaked = cut_into_folds(parted)
-    assert max(_folds_a_move(kept)) == 1
-    assert min(_folds_a_move(leaked)) == 4
+    piece_count = 4 * problem.cluster_count
+    move_of = np.arange(piece_count) // 4
+    by_move = cut_into_folds(parted, move_of=move_of)
+    by_piece = cut_into_folds(parted)
+    assert max(_folds_of_pieces(by_move)) == 1
+    assert min(_folds_of_pieces(by_piece)) == 4
 
 
-def _folds_a_move(folds: Folds) -> list[int]:
+def _folds_of_moves(move: IntArray, fold: IntArray) -> list[int]:
+    """In how many folds each move is."""
+    counts = []
+    for number in np.unique(move):
+        folds = np.unique(fold[move == number])
+        counts.append(len(folds))
+    return counts
+
+
+def _folds_of_pieces(folds: Folds) -> list[int]:
+    """In how many folds each move of four pieces is."""
     move = folds.linearisation.cluster // 4
-    fold = _fold_of_rows(folds)
-    return [len(np.unique(fold[move == number])) for number in np.unique(move)]
+    return _folds_of_moves(move, _fold_of_rows(folds))
 
 
 def test_pieces_of_a_short_recording_stay_in_the_fold_of_their_move(small: Evidence) -> None:
@@ -125,35 +149,45 @@ def test_pieces_of_a_short_recording_stay_in_the_fold_of_their_move(small: Evide
     assert folds.moves < folds.linearisation.cluster_count  # cut into pieces, as there are few
     fold = _fold_of_rows(folds)
     move = short.training.move[folds.linearisation.source]
-    assert all(len(np.unique(fold[move == number])) == 1 for number in np.unique(move))
+    assert max(_folds_of_moves(move, fold)) == 1
+
+
+def _verdicts(problem: SearchProblem) -> list[tuple[object, ...]]:
+    """What a search with one seed says of each candidate."""
+    rng = np.random.default_rng(4)
+    verdicts: list[tuple[object, ...]] = []
+    for finding in rank_effects(problem, rng, GATES):
+        candidate = (finding.effect, finding.axis)
+        verdicts.append((*candidate, finding.probability, finding.left_out_fall))
+    return verdicts
 
 
 def test_the_same_seed_gives_the_same_verdict(small: Evidence) -> None:
-    first, second = (
-        rank_effects(search_problem_of(small), np.random.default_rng(4), GATES) for _ in range(2)
-    )
-    expected = [(f.effect, f.axis, f.probability, f.left_out_fall) for f in second]
-    assert [(f.effect, f.axis, f.probability, f.left_out_fall) for f in first] == expected
+    first = _verdicts(search_problem_of(small))
+    second = _verdicts(search_problem_of(small))
+    assert first == second
 
 
 def test_a_setting_is_chosen_without_the_fold_that_it_is_scored_on(
     search_problem: SearchProblem,
 ) -> None:
     """A family is scored on each fold with the setting that the others chose, best on it or not."""
-    families = [tuple(Cogging(order) for order in range(1, 13))]
-    (tested,) = search_problem.test(families, 0)
+    orders = range(1, 13)
+    family = tuple(Cogging(order) for order in orders)
+    (tested,) = search_problem.test([family], 0)
     scored = tested.nested()
     trials = [trial for _, trial in tested.members]
-    left_out = np.stack([trial.left_out.sum(axis=1) for trial in trials])
     for fold in range(search_problem.folds.count):
-        chosen = max(range(len(trials)), key=lambda index: trials[index].training_fall[fold])
-        squares = trials[chosen].left_out
-        assert np.array_equal(scored[fold], squares[fold])
+        training_falls = [trial.training_fall[fold] for trial in trials]
+        chosen = trials[np.argmax(training_falls)]
+        assert np.array_equal(scored[fold], chosen.left_out[fold])
     # Among twelve settings that mean nothing, the best of each fold looks like an effect.
-    before = search_problem.folds.square_sum(search_problem.folds.residual).sum()
-    smallest_left_out = left_out.min(axis=0)
-    assert smallest_left_out.sum() < before
-    assert scored.sum() > left_out.min(axis=0).sum()
+    folds = search_problem.folds
+    before = folds.square_sum(folds.residual).sum()
+    errors = [trial.left_out.sum(axis=1) for trial in trials]
+    best_error = np.min(errors, axis=0).sum()
+    assert best_error < before
+    assert scored.sum() > best_error
 
 
 def test_the_choice_of_a_setting_does_not_see_its_fold(problem: Linearisation) -> None:
@@ -162,17 +196,29 @@ def test_the_choice_of_a_setting_does_not_see_its_fold(problem: Linearisation) -
     folds = cut_into_folds(problem)
     own = _fold_of_rows(folds) == 0
     columns = rng.normal(size=(len(own), 3))
-    residual = folds.linearisation.residual + 5.0 * own * columns[:, 0]
-    changed_linearisation = replace(folds.linearisation, residual=residual)
-    changed = cut_into_folds(changed_linearisation)
-    each_column = [slice(i, i + 1) for i in range(3)]
+    linear = folds.linearisation
+    added = 5.0 * own * columns[:, 0]
+    changed = cut_into_folds(replace(linear, residual=linear.residual + added))
+    each_column = [slice(0, 1), slice(1, 2), slice(2, 3)]
     before = score_candidates(folds, columns, each_column)
     after = score_candidates(changed, columns, each_column)
     for one, other in zip(before, after, strict=True):
         assert one is not None
         assert other is not None
-        assert other.training_fall[0] == pytest.approx(one.training_fall[0], rel=1e-6)
-        assert other.training_fall[1:] != pytest.approx(one.training_fall[1:], rel=1e-3)
+        on_own = pytest.approx(one.training_fall[0], rel=1e-6)
+        on_others = pytest.approx(one.training_fall[1:], rel=1e-3)
+        assert other.training_fall[0] == on_own
+        assert other.training_fall[1:] != on_others
+
+
+def _noise_of(evidence: Evidence) -> FloatArray:
+    """The measured currents less those that the estimate predicts."""
+    estimate = evidence.estimate
+    observed = evidence.training
+    to_motor = evidence.model.drive_train.to_motor
+    motor_torque = to_motor @ estimate.predicted_torque(observed)
+    predicted = motor_torque / estimate.gains[:, None]
+    return observed.current - predicted
 
 
 def test_shuffled_residuals_get_no_name(small: Evidence) -> None:
@@ -183,29 +229,26 @@ def test_shuffled_residuals_get_no_name(small: Evidence) -> None:
     most.
     """
     rng = np.random.default_rng(12)
-    estimate = small.estimate
-    observed = small.training
-    drive_train = small.model.drive_train
-    noise = (
-        observed.current
-        - drive_train.to_motor @ estimate.predicted_torque(observed) / estimate.gains[:, None]
-    )
+    noise = _noise_of(small)
+    move = small.training.move
+    move_count = int(move.max()) + 1
     # A choice of families, settings and axes that competes as the whole dictionary does, at a part
     # of its price.
     families = tuple(family[::4] for family in EFFECTS)
+    alone = tuple(family for family in families if family[0].name in KNOWN)
     cache: ColumnCache = {}
-    false = known = 0
+    false = 0
+    known = 0
     for _ in range(20):
-        largest_move = int(observed.move.max())
-        sign = rng.choice((-1.0, 1.0), size=(3, largest_move + 1))[:, observed.move]
+        sign_of_move = rng.choice((-1.0, 1.0), size=(3, move_count))
+        sign = sign_of_move[:, move]
         added_a = (sign - 1.0) * noise
         evidence = with_current(small, added_a)
         problem = search_problem_of(evidence, cache)
-        false += any(finding.passed for finding in rank_effects(problem, rng, GATES, families))
-        alone = tuple(family for family in families if family[0].name in KNOWN)
-        known += any(
-            finding.passed for finding in rank_effects(problem, rng, GATES, alone, known=KNOWN)
-        )
+        findings = rank_effects(problem, rng, GATES, families)
+        false += any(finding.passed for finding in findings)
+        related = rank_effects(problem, rng, GATES, alone, known=KNOWN)
+        known += any(finding.passed for finding in related)
     assert false <= 1
     assert known <= 2
 
@@ -233,19 +276,25 @@ def test_a_family_known_from_another_axis_competes_with_its_own_name(small: Evid
             assert related[key] <= probability
         else:
             assert related[key] == probability
-    assert sum(related[key] for key in plain) < sum(plain.values())
+    assert sum(related.values()) < sum(plain.values())
 
 
 def _noise_trial(
     rng: np.random.Generator, moves: int, columns: int, rows: int = 8
 ) -> CandidateTrial:
     """A candidate on noise alone, in moves of different loudness."""
-    x = rng.normal(size=(moves, rows, columns)) * rng.uniform(0.5, 2.0, size=(moves, 1, 1))
-    e = rng.normal(size=(moves, rows)) + 0.7 * rng.normal(size=(moves, 1))
+    x = rng.normal(size=(moves, rows, columns))
+    loudness = rng.uniform(0.5, 2.0, size=(moves, 1, 1))
+    x *= loudness
+    of_rows = rng.normal(size=(moves, rows))
+    of_moves = rng.normal(size=(moves, 1))
+    e = of_rows + 0.7 * of_moves
     gram = np.einsum("mra,mrb->mab", x, x)
     score = np.einsum("mra,mr->ma", x, e)
-    coefficients = np.linalg.solve(gram.sum(axis=0), score.sum(axis=0))
-    fall_by_motor = np.array([float(score.sum(axis=0) @ coefficients)])
+    total_score = score.sum(axis=0)
+    coefficients = np.linalg.solve(gram.sum(axis=0), total_score)
+    fall = float(total_score @ coefficients)
+    fall_by_motor = np.array([fall])
     scatter = score - gram @ coefficients
     left_out = np.zeros((8, 1))
     training_fall = np.zeros(8)
@@ -254,7 +303,7 @@ def _noise_trial(
         fall_by_motor=fall_by_motor,
         training_fall=training_fall,
         left_out=left_out,
-        score=score.sum(axis=0),
+        score=total_score,
         scatter=scatter,
         gram=gram,
     )
@@ -269,12 +318,14 @@ def test_the_bootstrap_keeps_its_size(
     search_problem: SearchProblem, moves: int, columns: int, least: int, most: int
 ) -> None:
     rng = np.random.default_rng(100 * moves + columns)
-    effect = (Stribeck(0.1), PositionFriction())[columns - 1]
+    effects = (Stribeck(0.1), PositionFriction())
+    effect = effects[columns - 1]
+    left_out = np.zeros((8, 3))
+    fall_by_motor = np.ones(3)
     false = 0
     for _ in range(400):
-        trial = replace(
-            _noise_trial(rng, moves, columns), left_out=np.zeros((8, 3)), fall_by_motor=np.ones(3)
-        )
+        on_noise = _noise_trial(rng, moves, columns)
+        trial = replace(on_noise, left_out=left_out, fall_by_motor=fall_by_motor)
         members = ((effect, trial),)
         tested = [FamilyTrials(0, members)]
         (finding,) = rank_families(search_problem, tested, rng, GATES)

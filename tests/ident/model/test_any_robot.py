@@ -55,54 +55,86 @@ class Kind:
     reach: FloatArray
 
 
-def _with(diagonal: list[float], entries: dict[tuple[int, int], float]) -> FloatArray:
+Couplings = dict[tuple[int, int], float]
+
+
+def _with(diagonal: list[float], entries: Couplings) -> FloatArray:
     ratio = np.diag(diagonal)
     for place, value in entries.items():
         ratio[place] = value
     return ratio
 
 
-KINDS = (
-    # A coupled wrist, as the paper's: motor 6 also turns with joint 5.
-    Kind(
-        "tx40.urdf",
-        _with([32, 32, 45, -48, 45, 32], {(5, 4): 32}),
-        np.array([33.9, 32.4, 24.2, -9.21, 16.3, 6.79]),
-        np.array([2.5, 1.8, 2.0, 3.0, 1.8, 3.0]),
-    ),
-    # A differential: motors 6 and 7 turn together with joint 6, against each other with joint 7.
-    Kind(
-        "seven-axis.urdf",
-        _with([100, 100, 80, -80, 60, 50, -50], {(5, 6): 50, (6, 5): 50}),
-        np.array([43.2, 39.6, 27.5, -24.8, 14.9, 7.75, -8.6]),
-        np.array([2.5, 1.8, 2.5, 1.9, 2.5, 1.8, 2.9]),
-    ),
-    # One belt for X and Y, a screw for Z, and a wrist motor that turns with both of its joints.
-    Kind(
-        "gantry.urdf",
-        _with([BELT, -BELT, SCREW, 80, 50], {(0, 1): BELT, (1, 0): BELT, (4, 3): -50}),
-        np.array([109.3, -101.2, 149.8, 12.7, 6.6]),
-        np.array([0.7, 0.45, 0.25, 3.0, 1.8]),
-    ),
+# A coupled wrist, as the paper's: motor 6 also turns with joint 5.
+TX40_RATIO = _with([32, 32, 45, -48, 45, 32], {(5, 4): 32})
+TX40_GAINS = np.array([33.9, 32.4, 24.2, -9.21, 16.3, 6.79])
+TX40_REACH = np.array([2.5, 1.8, 2.0, 3.0, 1.8, 3.0])
+TX40 = Kind(
+    "tx40.urdf",
+    TX40_RATIO,
+    TX40_GAINS,
+    TX40_REACH,
 )
-HEAVY = (
-    Kind(
-        "rx90.urdf",
-        _with([128, 128, 101, -75, 75, 60], {(5, 4): 60}),
-        np.array([44.1, 40.1, 33.6, -16.1, 18.2, 10.9]),
-        np.array([2.5, 1.6, 2.2, 3.0, 1.8, 3.0]),
-    ),
-    # An in-line wrist: motor 5 also turns with joint 4, motor 6 with joints 4 and 5.
-    Kind(
-        "kr270.urdf",
-        _with(
-            [256.857, 267.429, 252.333, 221, 239.619, 154.323],
-            {(4, 3): -59.905, (5, 3): 38.581, (5, 4): -51.441},
-        ),
-        np.array([353.2, 344.5, 320.4, 196.1, 195.3, 137.6]),
-        np.array([2.0, 1.1, 2.2, 3.0, 2.0, 3.0]),
-    ),
+
+# A differential: motors 6 and 7 turn together with joint 6, against each other with joint 7.
+SEVEN_AXIS_COUPLINGS: Couplings = {
+    (5, 6): 50,
+    (6, 5): 50,
+}
+SEVEN_AXIS_RATIO = _with([100, 100, 80, -80, 60, 50, -50], SEVEN_AXIS_COUPLINGS)
+SEVEN_AXIS_GAINS = np.array([43.2, 39.6, 27.5, -24.8, 14.9, 7.75, -8.6])
+SEVEN_AXIS_REACH = np.array([2.5, 1.8, 2.5, 1.9, 2.5, 1.8, 2.9])
+SEVEN_AXIS = Kind(
+    "seven-axis.urdf",
+    SEVEN_AXIS_RATIO,
+    SEVEN_AXIS_GAINS,
+    SEVEN_AXIS_REACH,
 )
+
+# One belt for X and Y, a screw for Z, and a wrist motor that turns with both of its joints.
+GANTRY_COUPLINGS: Couplings = {
+    (0, 1): BELT,
+    (1, 0): BELT,
+    (4, 3): -50,
+}
+GANTRY_RATIO = _with([BELT, -BELT, SCREW, 80, 50], GANTRY_COUPLINGS)
+GANTRY_GAINS = np.array([109.3, -101.2, 149.8, 12.7, 6.6])
+GANTRY_REACH = np.array([0.7, 0.45, 0.25, 3.0, 1.8])
+GANTRY = Kind(
+    "gantry.urdf",
+    GANTRY_RATIO,
+    GANTRY_GAINS,
+    GANTRY_REACH,
+)
+KINDS = (TX40, SEVEN_AXIS, GANTRY)
+
+RX90_RATIO = _with([128, 128, 101, -75, 75, 60], {(5, 4): 60})
+RX90_GAINS = np.array([44.1, 40.1, 33.6, -16.1, 18.2, 10.9])
+RX90_REACH = np.array([2.5, 1.6, 2.2, 3.0, 1.8, 3.0])
+RX90 = Kind(
+    "rx90.urdf",
+    RX90_RATIO,
+    RX90_GAINS,
+    RX90_REACH,
+)
+
+# An in-line wrist: motor 5 also turns with joint 4, motor 6 with joints 4 and 5.
+KR270_REDUCTIONS = [256.857, 267.429, 252.333, 221, 239.619, 154.323]
+KR270_COUPLINGS = {
+    (4, 3): -59.905,
+    (5, 3): 38.581,
+    (5, 4): -51.441,
+}
+KR270_RATIO = _with(KR270_REDUCTIONS, KR270_COUPLINGS)
+KR270_GAINS = np.array([353.2, 344.5, 320.4, 196.1, 195.3, 137.6])
+KR270_REACH = np.array([2.0, 1.1, 2.2, 3.0, 2.0, 3.0])
+KR270 = Kind(
+    "kr270.urdf",
+    KR270_RATIO,
+    KR270_GAINS,
+    KR270_REACH,
+)
+HEAVY = (RX90, KR270)
 """Beside these: in a chain of couplings a motor in another's place belongs to another joint,
 so that other rows count; and a heavy arm that leans is refused, not only fitted badly.
 """
@@ -111,13 +143,16 @@ CASES = list(product(ALL_KINDS, (UPRIGHT, LEANING)))
 
 
 def _kind(urdf: str) -> Kind:
-    return next(kind for kind in ALL_KINDS if kind.urdf == urdf)
+    kinds = {kind.urdf: kind for kind in ALL_KINDS}
+    return kinds[urdf]
 
 
 def _name(value: object) -> str:
     if isinstance(value, Kind):
         return value.urdf.removesuffix(".urdf")
-    return "upright" if value == UPRIGHT else "leaning"
+    if value == UPRIGHT:
+        return "upright"
+    return "leaning"
 
 
 @cache
@@ -125,8 +160,8 @@ def _truth(urdf: str, gravity: Gravity) -> tuple[Model, FloatArray, FloatArray]:
     """Model, standard parameters, and the inertial ones of a payload of 5 kg about the last joint's
     frame.
     """
-    text = (CONFIGS / "robots" / urdf).read_text()
-    robot = robot_from_urdf(text, gravity)
+    path = CONFIGS / "robots" / urdf
+    robot = robot_from_urdf(path.read_text(), gravity)
     drive_train = DriveTrain(_kind(urdf).ratio)
     model = Model(robot, drive_train)
     rng = np.random.default_rng(len(urdf))
@@ -136,9 +171,12 @@ def _truth(urdf: str, gravity: Gravity) -> tuple[Model, FloatArray, FloatArray]:
         link = _body(rng, mass)
         drive = _drive(rng)
         first = JOINT_COLUMNS * joint
-        parameters[first : first + JOINT_COLUMNS] = np.concatenate((link, drive))
+        end = first + JOINT_COLUMNS
+        of_joint = np.concatenate((link, drive))
+        parameters[first:end] = of_joint
     # Rotors and friction of coupled motors follow those of the joints.
-    coupled = parameters[JOINT_COLUMNS * robot.joint_count :]
+    first_coupled = JOINT_COLUMNS * robot.joint_count
+    coupled = parameters[first_coupled:]
     coupled[:] = rng.uniform(0.05, 0.5, coupled.size)
     payload = _body(rng, 5.0)
     return model, parameters, payload
@@ -149,9 +187,13 @@ def _body(rng: np.random.Generator, mass: float) -> FloatArray:
     centre = rng.uniform(-0.1, 0.1, 3)
     gyration_m = 0.06
     # Parallel axes: I = m ((r² + |c|²) E − c cᵀ).
-    diagonal = (gyration_m**2 + centre @ centre) * np.eye(3)
-    inertia = mass * (diagonal - np.outer(centre, centre))
-    return np.concatenate((inertia[np.triu_indices(3)], mass * centre, [mass]))
+    square = gyration_m**2 + centre @ centre
+    diagonal = square * np.eye(3)
+    products = np.outer(centre, centre)
+    inertia = mass * (diagonal - products)
+    upper = inertia[np.triu_indices(3)]
+    moment = mass * centre
+    return np.concatenate((upper, moment, [mass]))
 
 
 def _drive(rng: np.random.Generator) -> FloatArray:
@@ -164,8 +206,9 @@ def _drive(rng: np.random.Generator) -> FloatArray:
 
 def _conditioning(model: Model) -> Conditioning:
     standstill_of = {JointKind.PRISMATIC: 0.005, JointKind.REVOLUTE: 0.03}
-    standstill = tuple(standstill_of[joint.kind] for joint in model.robot.joints)
-    return Conditioning(standstill_rad_s=standstill)
+    joints = model.robot.joints
+    standstill = [standstill_of[joint.kind] for joint in joints]
+    return Conditioning(standstill_rad_s=tuple(standstill))
 
 
 @cache
@@ -193,13 +236,18 @@ def _run(
     rng: np.random.Generator,
 ) -> Run:
     q = positions(rng, 22.0, RATE_HZ, kind.reach)
-    time_s = np.arange(len(q)) / RATE_HZ
-    run = Run(name, time_s, q, np.zeros_like(q), mounted)
+    samples = np.arange(len(q))
+    time_s = samples / RATE_HZ
+    no_current = np.zeros_like(q)
+    run = Run(name, time_s, q, no_current, mounted)
     data = differentiate(run, model.drive_train, _conditioning(model))
-    joint_torque = np.einsum("jck,c->jk", model.regressor(data.motion()), parameters)
+    regressor = model.regressor(data.motion())
+    joint_torque = np.einsum("jck,c->jk", regressor, parameters)
     motor_torque = model.drive_train.to_motor @ joint_torque
+    gains = kind.gains[:, None]
+    needed = motor_torque / gains
     current_a = np.zeros_like(q)
-    current_a[1:-1] = (motor_torque / kind.gains[:, None]).T
+    current_a[1:-1] = needed.T
     return replace(run, current_a=current_a)
 
 
@@ -226,17 +274,26 @@ def test_without_noise_the_gains_are_exact(kind: Kind, gravity: Gravity) -> None
     parameters = _named_parameters(estimate)
     for name in ("mx", "my", "mz"):
         found = parameters[f"{name}:a"]
-        expected = payload[LINK_PARAMETERS.index(name)]
+        place = LINK_PARAMETERS.index(name)
+        expected = payload[place]
         assert found == pytest.approx(expected, rel=1e-4, abs=1e-6)
 
 
 def _is_link_parameter(name: str) -> bool:
-    return name.startswith(("I", "m")) and "Iam" not in name
+    is_of_link_or_rotor = name.startswith(("I", "m"))
+    return is_of_link_or_rotor and "Iam" not in name
 
 
 def _with_noise(run: Run, rng: np.random.Generator) -> Run:
     noise = rng.standard_normal(run.current_a.shape)
-    return replace(run, current_a=run.current_a * (1 + 0.02 * noise))
+    factor = 1 + 0.02 * noise
+    return replace(run, current_a=run.current_a * factor)
+
+
+def _in_order(run: Run, order: NDArray[np.intp]) -> Run:
+    """The run of a robot with its motors in another order."""
+    current_a = run.current_a[:, order]
+    return replace(run, current_a=current_a)
 
 
 @pytest.mark.slow
@@ -252,15 +309,19 @@ def test_permuting_the_motors_permutes_the_gains_and_nothing_else(
     """
     model, _, _ = _truth(kind.urdf, UPRIGHT)
     rng = np.random.default_rng(9)
-    runs = tuple(_with_noise(run, rng) for run in _runs(kind.urdf, UPRIGHT))
-    order = np.array(data.draw(st.permutations(range(len(kind.gains)))))
-    shuffled = tuple(replace(run, current_a=run.current_a[:, order]) for run in runs)
+    exact = _runs(kind.urdf, UPRIGHT)
+    runs = tuple(_with_noise(run, rng) for run in exact)
+    motors = range(len(kind.gains))
+    permutation = data.draw(st.permutations(motors))
+    order = np.array(permutation)
+    shuffled = tuple(_in_order(run, order) for run in runs)
     shuffled_train = DriveTrain(kind.ratio[order])
+    shuffled_model = Model(model.robot, shuffled_train)
     # One speed for all: which rows count must not depend on the order either.
     standstill = (0.02,) * len(order)
 
     before = _fit(model, runs, standstill)
-    after = _fit(Model(model.robot, shuffled_train), shuffled, standstill)
+    after = _fit(shuffled_model, shuffled, standstill)
 
     reduction = model.drive_train.reduction
     shuffled_reduction = shuffled_train.reduction
@@ -274,9 +335,12 @@ def test_permuting_the_motors_permutes_the_gains_and_nothing_else(
     found = _named_parameters(after)
     in_both = known.keys() & found.keys()
     links = {name for name in in_both if _is_link_parameter(name)}
-    assert len(links) > 0.6 * sum(name.startswith(("I", "m")) for name in known)
+    with_rotors = [name for name in known if name.startswith(("I", "m"))]
+    enough = 0.6 * len(with_rotors)
+    assert len(links) > enough
     for name in links:
-        assert found[name] == pytest.approx(known[name], rel=1e-5, abs=1e-6), name
+        expected = pytest.approx(known[name], rel=1e-5, abs=1e-6)
+        assert found[name] == expected, name
 
 
 @pytest.mark.parametrize("kind", KINDS, ids=_name)
@@ -287,9 +351,8 @@ def test_the_mounting_must_be_declared(kind: Kind) -> None:
     bare = _runs(kind.urdf, LEANING)[:1]
 
     def error_percent(model: Model) -> float:
-        identified = identify(
-            model, bare, _conditioning(model), method=Method.LS, fixed_gains=kind.gains
-        )
+        conditioning = _conditioning(model)
+        identified = identify(model, bare, conditioning, method=Method.LS, fixed_gains=kind.gains)
         return identified.training_error.total
 
     right = error_percent(leaning)
@@ -303,7 +366,11 @@ def test_the_mounting_must_be_declared(kind: Kind) -> None:
 def test_prismatic_joints_have_newton_for_their_friction() -> None:
     model, _, _ = _truth("gantry.urdf", UPRIGHT)
     units = {column.name: column.unit for column in model.columns}
-    of_slide = (units["Ia1"], units["fv1"], units["fs1"], units["off1"])
-    assert of_slide == ("kg", "N/(m/s)", "N", "N")
-    of_wrist = (units["Ia4"], units["fv4"], units["fs4"], units["off4"])
-    assert of_wrist == ("kg m²", "Nm/(rad/s)", "Nm", "Nm")
+    assert units["Ia1"] == "kg"
+    assert units["fv1"] == "N/(m/s)"
+    assert units["fs1"] == "N"
+    assert units["off1"] == "N"
+    assert units["Ia4"] == "kg m²"
+    assert units["fv4"] == "Nm/(rad/s)"
+    assert units["fs4"] == "Nm"
+    assert units["off4"] == "Nm"

@@ -20,49 +20,65 @@ from tests.ident.arms import CONFIGS, GANTRY, SEVEN_AXES, THREE_AXES
 
 FloatArray = NDArray[np.float64]
 
-SHIPPED = sorted((*CONFIGS.glob("robots/*.urdf"), *CONFIGS.glob("simulation/*.urdf")))
+ROBOT_FILES = CONFIGS.glob("robots/*.urdf")
+SIMULATED_FILES = CONFIGS.glob("simulation/*.urdf")
+SHIPPED = sorted((*ROBOT_FILES, *SIMULATED_FILES))
 LIMIT = '<limit lower="-1" upper="1" velocity="1" effort="1"/>'
 BODY = '<mass value="2"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/>'
 TWO_LINKS = (
     '<robot name="r"><link name="a"/><link '
-    'name="b"><inertial>' + BODY + '</inertial></link><joint name="j" '
+    f'name="b"><inertial>{BODY}</inertial></link><joint name="j" '
     'type="revolute"><origin xyz="0 0 1"/><parent link="a"/><child link="b"/><axis '
-    'xyz="0 0 1"/>' + LIMIT + "</joint></robot>"
+    f'xyz="0 0 1"/>{LIMIT}</joint></robot>'
 )
 
 
 def _assert_read_as_pinocchio_reads(urdf: str) -> None:
     model = pin.buildModelFromXML(urdf)
-    _assert_same(read_urdf(urdf), model, 1e-14)
+    _assert_same(read_urdf(urdf), model)
 
 
-def _assert_same(found: UrdfRobot, model: pin.Model, tolerance: float) -> None:
-    assert [joint.name for joint in found.joints] == list(model.names)[1:]
+def _assert_same(found: UrdfRobot, model: pin.Model) -> None:
+    _, *names = model.names
+    assert _names_of(found) == names
+    assert len(found.bodies) == len(names)
     assert found.effort_limit.tolist() == list(model.upperEffortLimit)
-    for number, (joint, body) in enumerate(zip(found.joints, found.bodies, strict=True), start=1):
+    for index, joint in enumerate(found.joints):
+        number = index + 1
         placement = model.jointPlacements[number]
-        inertia = model.inertias[number]
-        prismatic = joint.kind is JointKind.PRISMATIC
-        expected = model.parents[number] - 1
-        assert joint.parent == expected
+        assert joint.parent == model.parents[number] - 1
         assert _far(joint.rotation, placement.rotation) < 1e-14
         assert _far(joint.translation_m, placement.translation) < 1e-14
-        assert (
-            _far(joint.axis, _screw(model, number)[slice(0, 3) if prismatic else slice(3, 6)])
-            < 1e-14
-        )
+        assert _far(joint.axis, _axis_of(model, number, joint.kind)) < 1e-14
+    for index, body in enumerate(found.bodies):
+        inertia = model.inertias[index + 1]
         assert body.mass_kg == pytest.approx(inertia.mass, rel=1e-14)
         if body.mass_kg > 0.0:
             assert _far(body.centre_m, inertia.lever) < 1e-14
-        assert _far(body.inertia_kg_m2, inertia.inertia) < 1e-14 * max(
-            1.0, float(np.abs(inertia.inertia).max())
-        )
+        largest = float(np.abs(inertia.inertia).max())
+        tolerance = 1e-14 * max(1.0, largest)
+        assert _far(body.inertia_kg_m2, inertia.inertia) < tolerance
+
+
+def _names_of(robot: UrdfRobot) -> list[str]:
+    """Names of the joints that move."""
+    return [joint.name for joint in robot.joints]
+
+
+def _axis_of(model: pin.Model, number: int, kind: JointKind) -> FloatArray:
+    """The axis of a joint of Pinocchio: the first half of its screw is a velocity."""
+    screw = _screw(model, number)
+    if kind is JointKind.PRISMATIC:
+        return screw[:3]
+    return screw[3:]
 
 
 def _screw(model: pin.Model, number: int) -> FloatArray:
     joint = model.joints[number]
     motion = joint.createData()
-    joint.calc(motion, pin.neutral(model)[joint.idx_q : joint.idx_q + joint.nq])
+    neutral = pin.neutral(model)
+    end = joint.idx_q + joint.nq
+    joint.calc(motion, neutral[joint.idx_q : end])
     return np.asarray(motion.S, dtype=np.float64).reshape(6)
 
 
@@ -99,28 +115,38 @@ def test_held_joints_are_those_that_pinocchio_locks(seed: int, count: int) -> No
     urdf = _any_tree(seed, count)
     model = pin.buildModelFromXML(urdf)
     rng = np.random.default_rng(seed)
-    position = rng.choice([0.0, np.pi / 2, -0.7, 2.5], model.nv)
-    held = [
-        int(number)
-        for number in rng.permutation(np.arange(1, model.njoints))[: rng.integers(0, model.nv)]
-    ]
-    locked = pin.buildReducedModel(model, held, pin.integrate(model, pin.neutral(model), position))
-    position_rad = {model.names[number]: position[model.joints[number].idx_v] for number in held}
+    angles = [0.0, np.pi / 2, -0.7, 2.5]
+    position = rng.choice(angles, model.nv)
+    numbers = np.arange(1, model.njoints)
+    shuffled = rng.permutation(numbers)
+    count_held = rng.integers(0, model.nv)
+    held = shuffled[:count_held].tolist()
+    configuration = pin.integrate(model, pin.neutral(model), position)
+    locked = pin.buildReducedModel(model, held, configuration)
+    position_rad = {}
+    for number in held:
+        place = model.joints[number].idx_v
+        position_rad[model.names[number]] = position[place]
     found = hold_joints(urdf, position_rad)
-    _assert_same(read_urdf(found), locked, 1e-12)
+    _assert_same(read_urdf(found), locked)
 
 
 def _with_gripper(finger: str, thumb: str) -> str:
     """The two links with a gripper on the second;
     the arguments are type and content of its joints.
     """
-    return TWO_LINKS.replace(
-        "</robot>",
+    gripper = (
         f'<link name="f"><inertial>{BODY}</inertial></link><link '
         f'name="t"><inertial>{BODY}</inertial></link><joint name="finger" {finger}<parent '
         f'link="b"/><child link="f"/></joint><joint name="thumb" {thumb}<parent link="b"/><child '
-        'link="t"/></joint></robot>',
+        'link="t"/></joint>'
     )
+    return _with_more(TWO_LINKS, gripper)
+
+
+def _with_more(urdf: str, elements: str) -> str:
+    """A URDF with further elements at its end."""
+    return urdf.replace("</robot>", f"{elements}</robot>")
 
 
 TURNING = 'type="revolute"><origin xyz="0.1 0 0"/><axis xyz="0 0 2"/>' + LIMIT
@@ -134,24 +160,21 @@ def test_a_held_gripper_is_the_one_whose_joints_are_fixed_by_hand(angle: float) 
     sliding_thumb = SLIDING + FOLLOWING
     urdf = _with_gripper(TURNING, sliding_thumb)
     held = hold_joints(urdf, {"finger": angle})
-    thumb = f'type="fixed"><origin xyz="0.1 0 {0.1 - 2.0 * angle}"/>'
+    slid_m = 0.1 - 2.0 * angle
+    thumb = f'type="fixed"><origin xyz="0.1 0 {slid_m}"/>'
     finger = f'type="fixed"><origin xyz="0.1 0 0" rpy="0 0 {angle}"/>'
-    _assert_same_robot(
-        held,
-        _with_gripper(
-            finger,
-            thumb,
-        ),
-    )
-    _assert_same_robot(
-        held,
-        hold_joints(_with_gripper(TURNING, SLIDING), {"finger": angle, "thumb": 0.1 - 2 * angle}),
-    )
+    by_hand = _with_gripper(finger, thumb)
+    _assert_same_robot(held, by_hand)
+    free_thumb = _with_gripper(TURNING, SLIDING)
+    both_held = hold_joints(free_thumb, {"finger": angle, "thumb": slid_m})
+    _assert_same_robot(held, both_held)
 
 
 def _assert_same_robot(urdf: str, other: str) -> None:
-    (found,), (expected,) = read_urdf(urdf).bodies, read_urdf(other).bodies
-    assert found.mass_kg == expected.mass_kg == 6.0
+    (found,) = read_urdf(urdf).bodies
+    (expected,) = read_urdf(other).bodies
+    assert found.mass_kg == 6.0
+    assert expected.mass_kg == 6.0
     assert _far(found.centre_m, expected.centre_m) < 1e-13
     assert _far(found.inertia_kg_m2, expected.inertia_kg_m2) < 1e-11
 
@@ -186,11 +209,12 @@ def test_what_cannot_be_held_is_refused(urdf: str, held: dict[str, float], messa
         hold_joints(urdf, held)
 
 
-CHAINED = _with_gripper(TURNING, TURNING + '<mimic joint="finger" multiplier="2"/>').replace(
-    "</robot>",
+FOLLOWING_THUMB = _with_gripper(TURNING, TURNING + '<mimic joint="finger" multiplier="2"/>')
+TIP = (
     '<link name="u"/><joint name="tip" type="revolute"><parent link="t"/><child link="u"/><axis '
-    'xyz="0 0 1"/>' + LIMIT + '<mimic joint="thumb" multiplier="-3" offset="0.5"/></joint></robot>',
+    f'xyz="0 0 1"/>{LIMIT}<mimic joint="thumb" multiplier="-3" offset="0.5"/></joint>'
 )
+CHAINED = _with_more(FOLLOWING_THUMB, TIP)
 """A finger, a thumb that follows it, and a tip that follows the thumb."""
 
 
@@ -198,8 +222,7 @@ def test_a_follower_of_a_follower_is_where_the_chain_puts_it() -> None:
     held = hold_joints(CHAINED, {"finger": 0.1})
     position_rad = {"finger": 0.1, "thumb": 0.2, "tip": -0.1}
     by_hand = hold_joints(CHAINED, position_rad)
-    joints = read_urdf(held).joints
-    assert [joint.name for joint in joints] == ["j"]
+    assert _names_of(read_urdf(held)) == ["j"]
     _assert_same_robot(held, by_hand)
 
 
@@ -239,16 +262,15 @@ def test_a_follower_is_held_only_where_it_is(
 def test_a_follower_is_held_where_its_leader_puts_it() -> None:
     urdf = _with_gripper(TURNING + '<mimic joint="thumb"/>', TURNING)
     same = hold_joints(urdf, {"finger": 0.1, "thumb": 0.1})
-    joints = read_urdf(same).joints
-    assert [joint.name for joint in joints] == ["j"]
-    finger = TURNING + '<mimic joint="j" multiplier="0" offset="0.3"/>'
-    still = _with_gripper(finger, TURNING)
+    assert _names_of(read_urdf(same)) == ["j"]
     position_rad = {"finger": 0.3, "thumb": 0.0}
-    assert len(read_urdf(hold_joints(still, position_rad)).joints) == 1
+    finger = TURNING + '<mimic joint="j" multiplier="0" offset="0.3"/>'
+    still = hold_joints(_with_gripper(finger, TURNING), position_rad)
+    assert len(read_urdf(still).joints) == 1
     # Nothing of this URDF moves a follower of a joint that it does not have.
     turning_finger = TURNING + '<mimic joint="elsewhere"/>'
-    of_another = _with_gripper(turning_finger, TURNING)
-    assert len(read_urdf(hold_joints(of_another, {"finger": 0.3, "thumb": 0.0})).joints) == 1
+    of_another = hold_joints(_with_gripper(turning_finger, TURNING), position_rad)
+    assert len(read_urdf(of_another).joints) == 1
 
 
 @pytest.mark.parametrize(
@@ -275,19 +297,24 @@ def test_a_follower_of_a_follower_follows_the_first_joint() -> None:
     robot = robot_from_urdf(CHAINED)
     names = [joint.name for joint in robot.joints]
     assert [joint.name for joint in robot.axes] == ["j", "finger"]
-    ratios = {
-        names[one.follower]: (names[one.leader], one.multiplier, round(one.offset, 12))
-        for one in robot.couplings
-    }
-    expected = {"thumb": ("finger", 2.0, 0.0), "tip": ("finger", -6.0, 0.5)}
-    assert ratios == expected
+    couplings = {names[one.follower]: one for one in robot.couplings}
+    assert couplings.keys() == {"thumb", "tip"}
+    thumb = couplings["thumb"]
+    assert names[thumb.leader] == "finger"
+    assert thumb.multiplier == 2.0
+    assert round(thumb.offset, 12) == 0.0
+    tip = couplings["tip"]
+    assert names[tip.leader] == "finger"
+    assert tip.multiplier == -6.0
+    assert round(tip.offset, 12) == 0.5
 
 
 def test_a_floating_base_is_held_where_it_is() -> None:
     base = _with_gripper('type="floating"><origin xyz="1 2 3"/>', 'type="planar">')
     position_rad = {"finger": 0.0, "thumb": 0.0}
     held = hold_joints(base, position_rad)
-    _assert_same_robot(held, _with_gripper('type="fixed"><origin xyz="1 2 3"/>', 'type="fixed">'))
+    fixed = _with_gripper('type="fixed"><origin xyz="1 2 3"/>', 'type="fixed">')
+    _assert_same_robot(held, fixed)
 
 
 def _any_tree(seed: int, count: int) -> str:
@@ -295,31 +322,41 @@ def _any_tree(seed: int, count: int) -> str:
     names in any order.
     """
     rng = np.random.default_rng(seed)
-    names = [f"{letter}{number}" for number, letter in enumerate(rng.choice(list("zyABé_"), count))]
+    letters = rng.choice(list("zyABé_"), count)
     kinds = rng.choice(["revolute", "continuous", "prismatic", "fixed"], count)
     kinds[0] = "revolute"
     elements = [f'<link name="base">{_inertial(rng)}</link>']
-    for number, (name, kind) in enumerate(zip(names, kinds, strict=True)):
-        if number == 0 or rng.random() < 0.1:
-            parent = "base"
-        else:
-            parent = f"l{rng.integers(max(0, number - 3), number)}"
-        if rng.random() < 0.2:
-            axis = ""
-        else:
-            axis = f'<axis xyz="{_three(rng.choice(np.array([-1.0, 0.3, 1.0, 2.0]), 3))}"/>'
-        if kind in ("continuous", "fixed") and rng.random() < 0.5:
-            limit = ""
-        else:
-            limit = f'<limit velocity="1" effort="{number}"/>'
-        elements += [
-            f'<joint name="{name}" type="{kind}">{_origin(rng)}<parent link="{parent}"/><child '
-            f'link="l{number}"/>'
-            f"{axis}{limit}</joint>",
-            f'<link name="l{number}"><visual/>{_inertial(rng)}</link>',
-        ]
+    for number in range(count):
+        name = f"{letters[number]}{number}"
+        elements += _any_joint(rng, number, name, kinds[number])
     rng.shuffle(elements)
-    return f'<?xml version="1.0"?><!-- a tree --><robot name="r">{"".join(elements)}</robot>'
+    tree = "".join(elements)
+    return f'<?xml version="1.0"?><!-- a tree --><robot name="r">{tree}</robot>'
+
+
+AXIS_COMPONENTS = np.array([-1.0, 0.3, 1.0, 2.0])
+TURNS_RAD = np.array([0.0, np.pi / 2, np.pi, -1.2, 0.3])
+
+
+def _any_joint(rng: np.random.Generator, number: int, name: str, kind: str) -> list[str]:
+    """A joint behind one of the three links before it, or on the base; and its link."""
+    parent = "base"
+    if number > 0 and rng.random() >= 0.1:
+        first = max(0, number - 3)
+        parent = f"l{rng.integers(first, number)}"
+    axis = ""
+    if rng.random() >= 0.2:
+        components = rng.choice(AXIS_COMPONENTS, 3)
+        axis = f'<axis xyz="{_three(components)}"/>'
+    limit = f'<limit velocity="1" effort="{number}"/>'
+    may_be_unlimited = kind in ("continuous", "fixed")
+    if may_be_unlimited and rng.random() < 0.5:
+        limit = ""
+    origin = _origin(rng)
+    ends = f'<parent link="{parent}"/><child link="l{number}"/>'
+    joint = f'<joint name="{name}" type="{kind}">{origin}{ends}{axis}{limit}</joint>'
+    link = f'<link name="l{number}"><visual/>{_inertial(rng)}</link>'
+    return [joint, link]
 
 
 def _three(numbers: FloatArray) -> str:
@@ -327,25 +364,31 @@ def _three(numbers: FloatArray) -> str:
 
 
 def _origin(rng: np.random.Generator) -> str:
+    xyz = ""
     if rng.random() < 0.8:
-        xyz = f'xyz="{_three(rng.uniform(-2, 2, 3))}"'
-    else:
-        xyz = ""
-    turned = rng.choice(np.array([0.0, np.pi / 2, np.pi, -1.2, 0.3]), 3)
-    rpy = f'rpy="{_three(turned)}"' if rng.random() < 0.8 else ""
-    return f"<origin {xyz} {rpy}/>" if rng.random() < 0.9 else ""
+        place_m = rng.uniform(-2, 2, 3)
+        xyz = f'xyz="{_three(place_m)}"'
+    turned = rng.choice(TURNS_RAD, 3)
+    rpy = ""
+    if rng.random() < 0.8:
+        rpy = f'rpy="{_three(turned)}"'
+    if rng.random() < 0.9:
+        return f"<origin {xyz} {rpy}/>"
+    return ""
 
 
 def _inertial(rng: np.random.Generator) -> str:
     if rng.random() < 0.2:
         return ""
-    xx, xy, xz, yy, yz, zz = rng.uniform(0.0, 1.0, 6)
+    components = rng.uniform(0.0, 1.0, 6)
     mass = rng.choice([0.0, 0.7, 12.5])
-    inertia = f'<inertia ixx="{xx}" ixy="{xy}" ixz="{xz}" iyy="{yy}" iyz="{yz}" izz="{zz}"/>'
-    return (
-        f"<inertial>{_origin(rng)}<mass "
-        f'value="{mass}"/>{inertia if rng.random() < 0.9 else ""}</inertial>'
-    )
+    names = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+    attributes = [f'{name}="{value}"' for name, value in zip(names, components, strict=True)]
+    origin = _origin(rng)
+    inertia = ""
+    if rng.random() < 0.9:
+        inertia = f"<inertia {' '.join(attributes)}/>"
+    return f'<inertial>{origin}<mass value="{mass}"/>{inertia}</inertial>'
 
 
 @pytest.mark.parametrize(
@@ -413,8 +456,7 @@ def test_what_is_no_urdf_of_an_arm_is_refused(wrong: tuple[str, str], message: s
 def test_xacro_that_is_not_expanded_is_named(space: str) -> None:
     """An expanded file may still declare the namespace."""
     declared = TWO_LINKS.replace('name="r"', f'name="r" xmlns:xacro="{space}"', 1)
-    joints = read_urdf(declared).joints
-    assert [joint.name for joint in joints] == ["j"]
+    assert _names_of(read_urdf(declared)) == ["j"]
     macro = declared.replace("</robot>", '<xacro:arm prefix=""/></robot>')
     with pytest.raises(
         ModelError,
@@ -431,16 +473,15 @@ def test_xacro_that_is_not_expanded_is_named(space: str) -> None:
         read_urdf(expression)
 
 
+BACK = '<joint name="back" type="fixed"><parent link="b"/><child link="a"/></joint>'
+
+
 @pytest.mark.parametrize(
     ("urdf", "message"),
     [
         ('<robot name="r"/>', "has no <link>; expected the links of an arm"),
         (
-            TWO_LINKS.replace(
-                "</robot>",
-                '<joint name="back" type="fixed"><parent link="b"/><child '
-                'link="a"/></joint></robot>',
-            ),
+            _with_more(TWO_LINKS, BACK),
             "every link of the URDF is behind a joint; expected a tree",
         ),
     ],
@@ -470,14 +511,16 @@ def test_what_pinocchio_lets_pass_is_let_pass(twin: str) -> None:
 
 
 def test_a_link_with_two_parents_is_refused() -> None:
-    joint = TWO_LINKS[TWO_LINKS.index("<joint") : TWO_LINKS.index("</robot>")]
-    changed_joint = joint.replace('name="j"', 'name="k"')
-    twice = TWO_LINKS.replace("</robot>", changed_joint + "</robot>")
+    begin = TWO_LINKS.index("<joint")
+    end = TWO_LINKS.index("</robot>")
+    joint = TWO_LINKS[begin:end]
+    other_name = joint.replace('name="j"', 'name="k"')
+    twice = _with_more(TWO_LINKS, other_name)
     with pytest.raises(ModelError, match="'b' is the child of two joints; expected a tree"):
         read_urdf(twice)
-    urdf = TWO_LINKS.replace("</robot>", joint + "</robot>")
+    same_name = _with_more(TWO_LINKS, joint)
     with pytest.raises(ModelError, match="two joints of the URDF have the same name"):
-        read_urdf(urdf)
+        read_urdf(same_name)
 
 
 def test_the_arms_of_the_tests_can_be() -> None:
