@@ -13,7 +13,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
+from daq.config.cell import Cell
 from daq.config.cell_file import load_cell
 from daq.errors import (
     ClockImplausible,
@@ -36,7 +38,8 @@ from tests.conftest import CHECKOUT
 from tests.daq.logs import DISC, START_NS, content, demo_content, samples, write
 
 CELL = load_cell(CHECKOUT / "configs/cells/demo.yaml")
-DEMO_SCALING = scaling(CELL, Readback(tuple(AxisReadback(name, 0.002) for name in CELL.axis_names)))
+READBACK_AXES = tuple(AxisReadback(name, 0.002) for name in CELL.axis_names)
+DEMO_SCALING = scaling(CELL, Readback(READBACK_AXES))
 Recorder = Callable[..., Path]
 
 
@@ -57,6 +60,8 @@ def record(checkout: Path, tmp_path: Path) -> Recorder:
 
 
 ZEROS = (0,) * 6
+COUNTER_END = 2**31  #: first number that a counter of 32 bits does not have
+COUNTER_NUMBERS = 2**32
 TURN_COUNTS = 65536  #: of a motor
 FIRST_RATIO = 32  #: of J1
 
@@ -82,18 +87,19 @@ def test_joint_positions_are_those_of_the_drive_train(counts: list[int]) -> None
 
 
 def test_motor_six_also_turns_with_joint_five() -> None:
+    def joints_by_turn_of(motor: int) -> NDArray[np.float64]:
+        counts = np.zeros(6, dtype=int)
+        counts[motor] = TURN_COUNTS
+        return DEMO_SCALING.joint_position(counts)
+
     turn_rad = 2 * pi
-    counts = np.array([0, 0, 0, 0, 0, TURN_COUNTS])
-    turn_of_motor_6 = DEMO_SCALING.joint_position(counts)
     sixth_rad = turn_rad / 32
     expected = [0, 0, 0, 0, 0, sixth_rad]
-    np.testing.assert_allclose(turn_of_motor_6, expected, atol=1e-12)
+    np.testing.assert_allclose(joints_by_turn_of(5), expected, atol=1e-12)
 
-    counts = np.array([0, 0, 0, 0, TURN_COUNTS, 0])
-    turn_of_motor_5 = DEMO_SCALING.joint_position(counts)
     fifth_rad = turn_rad / 45
     expected = [0, 0, 0, 0, fifth_rad, -fifth_rad]
-    np.testing.assert_allclose(turn_of_motor_5, expected, atol=1e-12)
+    np.testing.assert_allclose(joints_by_turn_of(4), expected, atol=1e-12)
 
 
 def test_a_run_comes_from_the_log_alone(record: Recorder) -> None:
@@ -167,16 +173,23 @@ def _judged_again(*_: object) -> None:
     raise AssertionError("the channels were judged when the log was read")
 
 
+def with_payloads(**changes: Any) -> Cell:
+    """The demo cell, with each of its payloads changed."""
+    payloads = []
+    for payload in CELL.payloads:
+        payloads.append(replace(payload, **changes))
+    return replace(CELL, payloads=tuple(payloads))
+
+
 def test_another_cell_file_corrects_the_mass_that_was_typed_in(record: Recorder) -> None:
     """And what is printed of the payload is what was used."""
     log = record(steady(100), loaded=True)
-    payloads = tuple(replace(payload, mass_kg=5.049) for payload in CELL.payloads)
-    heavier = replace(CELL, payloads=payloads)
+    heavier = with_payloads(mass_kg=5.049)
     run, _ = load_run(log, heavier)
     assert run.payload is not None
     assert run.payload.known == {"m": 5.049}
-    changed_payloads = tuple(replace(payload, mounting="elsewhere") for payload in CELL.payloads)
-    other = replace(CELL, payloads=changed_payloads)
+
+    other = with_payloads(mounting="elsewhere")
     with pytest.raises(
         LogsDiffer, match="payload disc on flange-a, which the given description does not have"
     ):
@@ -202,8 +215,10 @@ def test_missing_and_saturated_samples_are_masked(record: Recorder) -> None:
     run, _ = load_run(path)
 
     assert run.valid is not None
-    masked = np.argwhere(~run.valid)
-    assert masked.tolist() == [[3, 2], [3, 5], [7, 0]]
+    masked = [tuple(place) for place in np.argwhere(~run.valid)]
+    missing = [(3, 2), (3, 5)]
+    saturated = [(7, 0)]
+    assert masked == missing + saturated
 
 
 def test_a_run_at_the_limit_is_refused(record: Recorder) -> None:
@@ -287,7 +302,7 @@ def test_a_sync_within_half_of_its_period_is_taken(record: Recorder) -> None:
 )
 def test_a_counter_that_ran_over_gives_the_way_that_was_gone(start: int, steps: list[int]) -> None:
     way = np.cumsum([start, *steps], dtype=np.int64)
-    wrapped = (way + 2**31) % 2**32 - 2**31
+    wrapped = (way + COUNTER_END) % COUNTER_NUMBERS - COUNTER_END
     counter = wrapped.astype(np.int32)
     resting_axis = np.full_like(counter, 7)
     counts = np.stack((counter, resting_axis), axis=1)
@@ -298,14 +313,15 @@ def test_a_counter_that_ran_over_gives_the_way_that_was_gone(start: int, steps: 
 def test_a_wrap_in_a_log_is_no_turn_of_the_joint(record: Recorder) -> None:
     """With an offset that puts the end of the counter in the middle of the joint's range."""
     rad_per_count = 2 * pi / TURN_COUNTS / FIRST_RATIO
-    end_rad = 2**31 * rad_per_count
-    changed_axis = replace(CELL.axes[0], zero_offset_rad=-end_rad)
-    axes = (changed_axis, *CELL.axes[1:])
-    cell = replace(CELL, axes=axes)
-    before_wrap = [2**31 - 3, 2**31 - 2, 2**31 - 1]
-    after_wrap = [-(2**31), -(2**31) + 1, -(2**31) + 2]
-    position_counts = [[count, 0, 0, 0, 0, 0] for count in before_wrap + after_wrap]
-    rows = [replace(row, current_raw=ZEROS) for row in samples(position_counts)]
+    end_rad = COUNTER_END * rad_per_count
+    first, *others = CELL.axes
+    changed_axis = replace(first, zero_offset_rad=-end_rad)
+    cell = replace(CELL, axes=(changed_axis, *others))
+    before_wrap = range(COUNTER_END - 3, COUNTER_END)
+    after_wrap = range(-COUNTER_END, -COUNTER_END + 3)
+    counts = [*before_wrap, *after_wrap]
+    rows = samples([(count, 0, 0, 0, 0, 0) for count in counts])
+    rows = [replace(row, current_raw=ZEROS) for row in rows]
     path = record(rows)
 
     run, _ = load_run(path, cell)
@@ -331,7 +347,8 @@ def test_the_scaled_numbers_of_an_import_do_not_wrap(checkout: Path, tmp_path: P
     run, _ = load_run(path)
 
     joint_rad = 0.01 / FIRST_RATIO
-    np.testing.assert_allclose(run.position_rad[:, 0], [joint_rad, -joint_rad])
+    found_rad = run.position_rad[:, 0]
+    np.testing.assert_allclose(found_rad, [joint_rad, -joint_rad])
 
 
 def test_an_invalid_run_is_refused(record: Recorder) -> None:
@@ -378,10 +395,13 @@ def bouncing(count: int = 3000, size: bool = True) -> list[Sample]:
     """Moves both ways, and currents of 2 Hz, of which the second is a size, or has its sign."""
     time_s = np.arange(count) / 1000.0
     phase_rad = 2.0 * pi * 0.7 * time_s
-    position = np.rint(20000.0 * np.sin(phase_rad))
+    swinging = 20000.0 * np.sin(phase_rad)
+    position = np.rint(swinging).astype(int)
     current_phase_rad = 2.0 * pi * 2.0 * time_s + 0.3
-    current = np.rint(400.0 * np.sin(current_phase_rad))
-    rows = samples([[int(counts)] * 6 for counts in position])
+    alternating = 400.0 * np.sin(current_phase_rad)
+    current = np.rint(alternating)
+    position_counts = [(count,) * 6 for count in position.tolist()]
+    rows = samples(position_counts)
     found = []
     for row, value in zip(rows, current, strict=True):
         signed = int(value)
@@ -422,7 +442,8 @@ def test_a_temperature_that_no_motor_has_is_left_out() -> None:
     samples_of_log = SimpleNamespace(time_ns=time_ns, position_counts=position_counts)
     log: Any = SimpleNamespace(readings=readings, samples=samples_of_log)
     nothing = [np.nan] * 3
-    expected = np.column_stack([[30.0, 31.0, 32.0], nothing, nothing])
+    interpolated = [30.0, 31.0, 32.0]
+    expected = np.column_stack([interpolated, nothing, nothing])
     celsius_of_samples = temperatures(log)
     assert celsius_of_samples is not None
     np.testing.assert_allclose(celsius_of_samples, expected)
