@@ -59,9 +59,10 @@ def at(
 
 def stands_still(kind: FaultKind, toggle_bit: ToggleBit | None = None) -> Promise:
     """Positions that stay the same for so long that the moves should have changed them."""
+    text = J3 + "move 0: .* do not change"
     return Promise(
         at(kind),
-        J3 + "move 0: .* do not change",
+        text,
         EventKind.FROZEN,
         within_cycles=60,
         toggle_bit=toggle_bit,
@@ -82,9 +83,14 @@ def foreign_sync(fault: FaultSpec) -> Promise:
     return Promise(fault, text, EventKind.BUS_BUSY, BusBusy)
 
 
+NO_HEARTBEAT = J3 + "no heart"
+LIMIT_IS_ACTIVE = J3 + "a limit has been active for 0.5 s"
+NO_TOGGLE = J3 + "statusword bit 14 has not toggled"
+SENSOR_FAULT = at(FaultKind.EMERGENCY, 0x7305)
+SECOND_MASTER = at(FaultKind.SECOND_MASTER, axis=None)
 STOPS = {
     "emcy": Promise(
-        at(FaultKind.EMERGENCY, 0x7305),
+        SENSOR_FAULT,
         "7305h incremental sensor 1 fault",
         EventKind.EMCY,
     ),
@@ -110,20 +116,20 @@ STOPS = {
     ),
     "heartbeat": Promise(
         at(FaultKind.NO_HEARTBEAT),
-        J3 + "no heart",
+        NO_HEARTBEAT,
         EventKind.HEARTBEAT_LOST,
         within_cycles=330,
     ),
     "limit": Promise(
         at(FaultKind.LIMIT),
-        J3 + "a limit has been active for 0.5 s",
+        LIMIT_IS_ACTIVE,
         EventKind.LIMIT,
     ),
     "frozen": stands_still(FaultKind.FROZEN),
     "stale": stands_still(FaultKind.STALE),
     "stale, toggle bit": Promise(
         at(FaultKind.STALE),
-        J3 + "statusword bit 14 has not toggled",
+        NO_TOGGLE,
         EventKind.FROZEN,
         toggle_bit=14,
     ),
@@ -136,7 +142,7 @@ STOPS = {
     ),
     "wrong-cob-id": no_answer(FaultKind.WRONG_COB_ID),
     "lost": no_answer(FaultKind.LOST),
-    "second-master": foreign_sync(at(FaultKind.SECOND_MASTER, axis=None)),
+    "second-master": foreign_sync(SECOND_MASTER),
 }
 
 

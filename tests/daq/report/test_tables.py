@@ -113,9 +113,27 @@ def known_history(tmp_path_factory: pytest.TempPathFactory) -> KnownHistory:
     return KnownHistory(entries, series, actions)
 
 
+Example = Callable[[Cell, KnownHistory], Iterable[RenderableType]]
+
+EXAMPLES: dict[str, Example] = {}
+"""One for each function that makes a table, by file and name."""
+
+
+def example_of(*names: str) -> Callable[[Example], Example]:
+    """Enter an example by the functions of which it makes the tables."""
+
+    def enter(example: Example) -> Example:
+        for name in names:
+            EXAMPLES[name] = example
+        return example
+
+    return enter
+
+
 # Each example below makes the tables of one view, from the longest values that it may meet.
 
 
+@example_of("bus_views.scan_table")
 def _scan(cell: Cell, _: KnownHistory) -> Iterator[RenderableType]:
     nodes = [_node(number) for number in range(14)]
     yield bus_views.scan_table(nodes)
@@ -142,6 +160,7 @@ def _node(number: int) -> ScannedNode:
     )
 
 
+@example_of("bus_views.monitor_view", "bus_views.prediction_view")
 def _monitor(cell: Cell, _: KnownHistory) -> Iterator[RenderableType]:
     axis = AxisReading(
         position_counts=-123456,
@@ -171,6 +190,7 @@ def _monitor(cell: Cell, _: KnownHistory) -> Iterator[RenderableType]:
     yield bus_views.monitor_view(report)
 
 
+@example_of("fit.comparison_tables")
 def _comparison(cell: Cell, _: KnownHistory) -> Iterable[RenderableType]:
     values = np.array([gain.value for gain in GAINS])
     std = np.full(len(GAINS), 12.34)
@@ -181,6 +201,7 @@ def _comparison(cell: Cell, _: KnownHistory) -> Iterable[RenderableType]:
     return fit.comparison_tables(comparison, AXES)
 
 
+@example_of("residual.turns_view")
 def _turns(cell: Cell, _: KnownHistory) -> Iterator[RenderableType]:
     after: Any = None  # the table needs nothing of it
     effect = SimpleNamespace(name="position-dependent-friction")
@@ -201,6 +222,7 @@ def _turns(cell: Cell, _: KnownHistory) -> Iterator[RenderableType]:
     return residual.turns_view(fitted)
 
 
+@example_of("validation.validation_view")
 def _validation(cell: Cell, _: KnownHistory) -> Iterator[RenderableType]:
     rng = np.random.default_rng(1)
     measured_nm = rng.normal(size=(14, 50))
@@ -231,6 +253,7 @@ def _validation(cell: Cell, _: KnownHistory) -> Iterator[RenderableType]:
     return validation.validation_view(calibration, found)
 
 
+@example_of("weighing_views.weighed_view")
 def _weighed(cell: Cell, _: KnownHistory) -> Iterator[RenderableType]:
     centre_m = np.full(3, -0.12345)
     centre_std_m = np.full(3, 0.000123)
@@ -256,6 +279,7 @@ def _weighed(cell: Cell, _: KnownHistory) -> Iterator[RenderableType]:
     return weighing_views.weighed_view(found)
 
 
+@example_of("weighing_views.contact_view")
 def _contact(cell: Cell, _: KnownHistory) -> Iterator[RenderableType]:
     contact = SimpleNamespace(
         axis=2,
@@ -296,6 +320,7 @@ def _contact(cell: Cell, _: KnownHistory) -> Iterator[RenderableType]:
     return weighing_views.contact_view(found, cell)
 
 
+@example_of("urdf_views.urdf_view")
 def _urdf(cell: Cell, _: KnownHistory) -> Iterator[RenderableType]:
     centre_m = (-1.234, 2.345, -3.456)
     body = SimpleNamespace(centre_m=centre_m, mass_kg=123.0)
@@ -317,6 +342,7 @@ def _urdf(cell: Cell, _: KnownHistory) -> Iterator[RenderableType]:
     return urdf_views.urdf_view(CALIBRATION, choice, updates, updated, None)
 
 
+@example_of("mjcf_views.mjcf_view")
 def _mjcf(cell: Cell, _: KnownHistory) -> Iterator[RenderableType]:
     joints = [_mjcf_joint(axis) for axis in AXES]
     actuators = [_mjcf_actuator(gain) for gain in GAINS]
@@ -358,6 +384,7 @@ def _mjcf_actuator(gain: Gain) -> SimpleNamespace:
     return SimpleNamespace(axis=gain.axis, acts_on=tendon, gear=gain.value, unit="Nm/A")
 
 
+@example_of("full_parameters.full_parameter_table", "full_parameters.gains_with_prior_table")
 def _full(cell: Cell, _: KnownHistory) -> Iterator[RenderableType]:
     of_prior = FullParameter("Ixx12", -1.2345e-17, 1.2e-5, "kg m²", "prior", 1.0, 123.45, 1.2e-5)
     of_data = FullParameter("fvm12", 1.234e-5, 1.2e-6, "Nm/(rad/s)", "data", 0.0, None, None)
@@ -372,6 +399,7 @@ def _full(cell: Cell, _: KnownHistory) -> Iterator[RenderableType]:
     return full_parameters.full_parameter_view(CALIBRATION, full)
 
 
+@example_of("fleet.fleet_view")
 def _fleet(cell: Cell, _: KnownHistory) -> Iterator[RenderableType]:
     sha256 = "c" * 64
     effects = (("load-friction", AXES[3]),)
@@ -382,6 +410,7 @@ def _fleet(cell: Cell, _: KnownHistory) -> Iterator[RenderableType]:
     return fleet_view([fitted, failed])
 
 
+@example_of("proposal.change_table")
 def _changes(cell: Cell, _: KnownHistory) -> Iterator[RenderableType]:
     changes = []
     for number, gain in enumerate(GAINS):
@@ -400,6 +429,7 @@ def _changes(cell: Cell, _: KnownHistory) -> Iterator[RenderableType]:
     yield proposal.change_table(tuple(changes), NOTHING)
 
 
+@example_of("paper_tables.view")
 def _paper(cell: Cell, _: KnownHistory) -> Iterator[RenderableType]:
     headings = ("parameter", *["10 CAD: value"] * 6)
     row = ("zz1", *["1.2345678"] * 6)
@@ -407,59 +437,37 @@ def _paper(cell: Cell, _: KnownHistory) -> Iterator[RenderableType]:
     return table.view()
 
 
+@example_of("fit.error_table")
 def _error(cell: Cell, _: KnownHistory) -> Iterator[RenderableType]:
     yield fit.error_table("Error", AXES, {"held out, before": ERROR})
 
 
+@example_of("gains.gain_table")
 def _gain(cell: Cell, _: KnownHistory) -> Iterator[RenderableType]:
     truth = dict.fromkeys(AXES, -1230.5)
     yield gains.gain_table(GAINS, truth, title="Gains")
 
 
+@example_of("gains.torque_table")
 def _torque(cell: Cell, _: KnownHistory) -> Iterator[RenderableType]:
     slope = TorqueSlope(-1250.0, 0.0123, 98765)
     slopes = [slope] * len(GAINS)
     yield gains.torque_table(slopes, GAINS)
 
 
+@example_of("history.axis_table")
 def _history_of_axis(cell: Cell, known: KnownHistory) -> Iterator[RenderableType]:
     yield history.axis_table(known.series[3], known.actions)
 
 
+@example_of("history.calibration_table")
 def _history_of_calibrations(cell: Cell, known: KnownHistory) -> Iterator[RenderableType]:
     yield history.calibration_table(known.entries, known.series, known.actions)
 
 
+@example_of("history.history_gain_table")
 def _history_of_gains(cell: Cell, known: KnownHistory) -> Iterator[RenderableType]:
     yield history.history_gain_table(known.series)
-
-
-Example = Callable[[Cell, KnownHistory], Iterable[RenderableType]]
-
-EXAMPLES: dict[str, Example] = {
-    "bus_views.monitor_view": _monitor,
-    "bus_views.prediction_view": _monitor,
-    "bus_views.scan_table": _scan,
-    "fit.comparison_tables": _comparison,
-    "fit.error_table": _error,
-    "fleet.fleet_view": _fleet,
-    "full_parameters.full_parameter_table": _full,
-    "full_parameters.gains_with_prior_table": _full,
-    "gains.gain_table": _gain,
-    "gains.torque_table": _torque,
-    "history.axis_table": _history_of_axis,
-    "history.calibration_table": _history_of_calibrations,
-    "history.history_gain_table": _history_of_gains,
-    "mjcf_views.mjcf_view": _mjcf,
-    "paper_tables.view": _paper,
-    "proposal.change_table": _changes,
-    "residual.turns_view": _turns,
-    "urdf_views.urdf_view": _urdf,
-    "validation.validation_view": _validation,
-    "weighing_views.contact_view": _contact,
-    "weighing_views.weighed_view": _weighed,
-}
-"""One for each function that makes a table, by file and name."""
 
 
 def _called_names(tree: ast.AST) -> set[str]:
@@ -481,12 +489,14 @@ def test_every_function_that_makes_a_table_has_an_example(checkout: Path) -> Non
             continue
         source = path.read_text(encoding="utf-8")
         tree = ast.parse(source)
-        functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
-        for function in functions:
+        for function in ast.walk(tree):
+            if not isinstance(function, ast.FunctionDef):
+                continue
             called = _called_names(function)
             if makes_table & called:
                 makers.add(f"{path.stem}.{function.name}")
-        if "rich.table" in source and "Table" in _called_names(tree):
+        imports_table = "rich.table" in source
+        if imports_table and "Table" in _called_names(tree):
             others.add(path.name)
     assert makers == EXAMPLES.keys()
     assert others == set(), "use plain_table of daq/report/text.py, whose tables never cut a value"
@@ -536,8 +546,9 @@ def test_every_number_of_a_table_is_whole_at_80_columns_and_in_a_pipe(
             assert "…" not in shown
             cut = [number for number in numbers if number not in shown]
             assert cut == []
-            line_widths = [cell_len(line.rstrip()) for line in shown.splitlines()]
-            assert max(line_widths) <= width
+            for line in shown.splitlines():
+                printed = line.rstrip()
+                assert cell_len(printed) <= width
 
 
 def test_a_row_keeps_its_style_in_every_form() -> None:
@@ -569,6 +580,11 @@ def test_an_error_of_a_fleet_is_below_its_table() -> None:
     assert f"press-4: DataUnfit: {text}" in lines
 
 
+def _lines_of_log(described: dict[str, Any]) -> list[str]:
+    lines = log_lines(described, 80)
+    return [str(line) for line in lines]
+
+
 def test_numbers_of_a_log_have_no_exponent_and_none_that_a_person_has_no_use_for() -> None:
     described = {
         "stamped_duration_s": 1234567.8,
@@ -576,7 +592,7 @@ def test_numbers_of_a_log_have_no_exponent_and_none_that_a_person_has_no_use_for
         "wall_minus_monotonic_s": 1.79565e9,
         "left": 1e-7,
     }
-    lines = [str(line) for line in log_lines(described, 80)]
+    lines = _lines_of_log(described)
     assert lines == [
         "stamped duration s  1234568",
         "rate hz             1000",
@@ -586,11 +602,14 @@ def test_numbers_of_a_log_have_no_exponent_and_none_that_a_person_has_no_use_for
 
 def test_a_log_is_described_in_whole_words() -> None:
     digest = "0123456789abcdef" * 4
-    missing = {f"J{number}": 100 + number for number in range(40)}
+    missing = {}
+    for number in range(40):
+        axis = f"J{number}"
+        missing[axis] = 100 + number
     described = {"sha256": digest, "stamped_duration_s": 12345.678, "missing": missing}
-    lines = [str(line) for line in log_lines(described, 80)]
-    line_widths = [cell_len(line) for line in lines]
-    assert max(line_widths) <= 80
+    lines = _lines_of_log(described)
+    for line in lines:
+        assert cell_len(line) <= 80
     assert f"  {digest}" in lines
     text = "\n".join(lines)
     words = " ".join(text.split())

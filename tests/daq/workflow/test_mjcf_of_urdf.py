@@ -206,16 +206,16 @@ def test_shapes_are_where_the_urdf_has_them(
     mujoco.mj_kinematics(simulated, data)
     placed = poses(robot.model.robot, robot.states.position_rad[3:4])
 
-    visuals = {}
-    collisions = {}
+    visuals: dict[str, Any] = {}
+    collisions: dict[str, Any] = {}
+    of_groups = {VISUAL_GROUP: visuals, COLLISION_GROUP: collisions}
     for geom in geoms_of(simulated):
         link = body_name(simulated, geom)
-        of_group = visuals if geom.group[0] == VISUAL_GROUP else collisions
+        of_group = of_groups[geom.group[0]]
         assert link not in of_group
         of_group[link] = geom
     assert set(visuals) == {"link1", "link2", "link3", "link5", "link6"}
     assert set(collisions) == {"link3"}
-    assert collisions["link3"].group[0] == COLLISION_GROUP
     assert not simulated.geom_contype.any()
     assert not simulated.geom_conaffinity.any()
 

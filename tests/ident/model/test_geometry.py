@@ -129,7 +129,12 @@ def test_an_unknown_length_is_refused_with_those_that_there_are() -> None:
 def _model(spec: CellSpec) -> Model:
     pairs = []
     for closure in spec.closures:
-        pair = LinkPair(closure.name, closure.first, closure.second, closure.directions)
+        pair = LinkPair(
+            closure.name,
+            closure.first,
+            closure.second,
+            closure.directions,
+        )
         pairs.append(pair)
     assembly_rad = dict(spec.assembly_rad)
     robot = robot_from_urdf(
