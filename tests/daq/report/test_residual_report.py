@@ -774,9 +774,9 @@ def _with_three_effects(closed: Closed) -> Closed:
 
 def _holdout_change(rise: float) -> ErrorChange:
     """Change of the whole error on 20 held-out blocks, with a σ of one, and of no motor."""
-    whole = PairedChange(rise, 1.0, 20)
+    total = PairedChange(rise, 1.0, 20)
     unchanged = PairedChange(0.0, 0.0, 0)
-    return ErrorChange(whole, (unchanged,) * 3, np.ones(3))
+    return ErrorChange(total, (unchanged,) * 3, np.ones(3))
 
 
 def _calibrated(made: Closed, effects: int) -> Calibration:
