@@ -441,9 +441,9 @@ def test_other_options_are_another_fit(few: Path, tmp_path: Path) -> None:
     _fitted(few, out)
     opened = open_cache(out, Loop.OPEN)
     closed = open_cache(out, Loop.CLOSED)
-    for cell in logs:
-        assert opened.cached(cell) is not None
-        assert closed.cached(cell) is None
+    for cell_logs in logs:
+        assert opened.cached(cell_logs) is not None
+        assert closed.cached(cell_logs) is None
 
 
 KILLED = """

@@ -452,7 +452,7 @@ def test_another_cell_of_the_same_audit_has_its_own(cell_file: Path) -> None:
     entered = {"cell": "another", "sha256": "2" * 64, "entered": "x", "document": "y"}
     since = BEGIN.isoformat()
     acknowledged = {"cell": "another", "axis": "J4", "since": since, "why": "z"}
-    details_of_action = {
+    details_of_action: dict[AuditAction, dict[str, Any]] = {
         AuditAction.APPLIED: applied,
         AuditAction.CALIBRATION_ENTERED: entered,
         AuditAction.ACKNOWLEDGED: acknowledged,

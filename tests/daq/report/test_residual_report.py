@@ -452,8 +452,8 @@ def test_what_files_say_is_escaped(closed: Closed) -> None:
     assert "<script" not in text
     page = Reader(text)
     for element in page.elements:
-        source = element.attributes.get("src") or "data:"
-        assert source.startswith("data:")
+        address = element.attributes.get("src") or "data:"
+        assert address.startswith("data:")
     assert f"Cell {HOSTILE}" in page.texts
 
 

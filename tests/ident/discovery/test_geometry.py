@@ -509,7 +509,7 @@ def test_check_geometry_where_j1_hardly_moves_names_the_lean_and_the_zero_of_j2(
     less = np.array([0.06, 1.0, 1.0])
 
     def with_j1_hardly_moving(position_rad: FloatArray) -> FloatArray:
-        return position_rad * less
+        return np.asarray(position_rad * less)
 
     runs: list[Run] = []
     for number, payload in enumerate(PAYLOADS):
