@@ -41,24 +41,38 @@ def cells(small_truth: Truth) -> tuple[WeighedCell, ...]:
 def rows(small_truth: Truth, cells: tuple[WeighedCell, ...]) -> tuple[RowsToWeigh, RowsToWeigh]:
     """Rows of the first cell: with the body alone, and beside a run without load."""
     one = cells[0]
-    return (
-        rows_to_weigh(small_truth.model, [one.loaded], one.conditioning),
-        rows_to_weigh(small_truth.model, [one.loaded], one.conditioning, bare=[one.bare]),
-    )
+    model = small_truth.model
+    alone = rows_to_weigh(model, [one.loaded], one.conditioning)
+    with_bare = rows_to_weigh(model, [one.loaded], one.conditioning, bare=[one.bare])
+    return (alone, with_bare)
 
 
 def _without_effects(calibration: Calibration) -> Calibration:
-    left = tuple(one for one in calibration.parameters if "friction" not in one.name)
+    parameters = calibration.parameters
+    left = tuple(one for one in parameters if "friction" not in one.name)
     return replace(calibration, parameters=left, effects=(), covariance_factor=None)
 
 
+def _body_of(ten: FloatArray, covariance: FloatArray) -> WeighedBody:
+    error = RelativeError((), 0.0)
+    scale = Scale.__new__(Scale)
+    return WeighedBody(ten, covariance, covariance, True, 9, error, scale)
+
+
+def _motion(position_rad: FloatArray, rate_hz: float) -> Motion:
+    """The motion of positions, by differences between samples."""
+    velocity = np.gradient(position_rad, axis=0) * rate_hz
+    acceleration = np.gradient(velocity, axis=0) * rate_hz
+    return Motion(position_rad, velocity, acceleration)
+
+
 def _scores(cell: WeighedCell, found: WeighedBody) -> FloatArray:
-    mass = cell.body[-1]
-    centre, std = found.centre_m
-    mass_difference_kg = found.mass_kg - mass
-    return np.concatenate(
-        ([mass_difference_kg / found.mass_std_kg], (centre - cell.body[6:9] / mass) / std)
-    )
+    mass_kg = cell.body[-1]
+    centre_m = cell.body[6:9] / mass_kg
+    mass_score = (found.mass_kg - mass_kg) / found.mass_std_kg
+    found_centre_m, std_m = found.centre_m
+    centre_scores = (found_centre_m - centre_m) / std_m
+    return np.concatenate(([mass_score], centre_scores))
 
 
 @pytest.mark.slow
@@ -66,15 +80,15 @@ def test_errors_are_as_large_as_their_sigma(
     small_truth: Truth, cells: tuple[WeighedCell, ...]
 ) -> None:
     """`make weigh-study` counts a hundred cells."""
+    model = small_truth.model
     scores_of_cells = []
     for cell in cells:
         for bare in ([], [cell.bare]):
-            weighed = weigh(
-                cell.calibration, small_truth.model, [cell.loaded], cell.conditioning, bare=bare
-            )
+            weighed = weigh(cell.calibration, model, [cell.loaded], cell.conditioning, bare=bare)
             scores_of_cells.append(_scores(cell, weighed))
     scores = np.array(scores_of_cells)
-    rms_scores = np.sqrt(np.mean(scores**2))
+    mean_square = np.mean(scores**2)
+    rms_scores = np.sqrt(mean_square)
     assert 0.5 < rms_scores < 1.6
     assert np.abs(scores).max() < 4.0
 
@@ -83,10 +97,16 @@ def test_without_the_effects_sigma_is_wide_and_the_residual_large(
     cells: tuple[WeighedCell, ...], rows: tuple[RowsToWeigh, RowsToWeigh]
 ) -> None:
     calibration = cells[0].calibration
-    whole = weigh_rows(calibration, rows[1])
-    without = weigh_rows(_without_effects(cells[0].calibration), rows[1])
-    assert without.moves_covariance[-1, -1] > 1.3**2 * whole.moves_covariance[-1, -1]
-    assert without.error.axes[AXIS] > 1.3 * whole.error.axes[AXIS]
+    with_effects = weigh_rows(calibration, rows[1])
+    without = weigh_rows(_without_effects(calibration), rows[1])
+    variances_with = np.diag(with_effects.moves_covariance)
+    variances_without = np.diag(without.moves_covariance)
+    variance_with = variances_with[-1]
+    variance_without = variances_without[-1]
+    assert variance_without > 1.3**2 * variance_with
+    error_with = with_effects.error.axes[AXIS]
+    error_without = without.error.axes[AXIS]
+    assert error_without > 1.3 * error_with
 
 
 @pytest.mark.parametrize("beside", [0, 1])
@@ -97,21 +117,31 @@ def test_an_error_of_the_calibration_is_in_sigma_as_it_is_in_the_body(
     its share of σ is the shift that this error makes.
     """
     calibration = _without_effects(cells[0].calibration)
-    values = np.array(
-        [one.value for one in calibration.gains] + [one.value for one in calibration.parameters]
-    )
+    gains = [one.value for one in calibration.gains]
+    parameters = [one.value for one in calibration.parameters]
+    values = np.array(gains + parameters)
     rng = np.random.default_rng(5)
-    error = 1e-4 * rng.standard_normal(len(values)) * np.maximum(np.abs(values), 1e-2)
-    root = tuple((float(value), *([0.0] * index)) for index, value in enumerate(error))
-    changed_calibration = replace(calibration, covariance_factor=root)
-    certain = weigh_rows(changed_calibration, rows[beside])
+    relative_error = 1e-4 * rng.standard_normal(len(values))
+    sizes = np.maximum(np.abs(values), 1e-2)
+    error = relative_error * sizes
+    # Rows of a lower triangle, of which only the first column is not zero.
+    root = []
+    for index, value in enumerate(error):
+        zeros = [0.0] * index
+        root.append((float(value), *zeros))
+    with_error = replace(calibration, covariance_factor=tuple(root))
     moved = _changed(calibration, values + error)
-    shift = weigh_rows(moved, rows[beside]).values - weigh_rows(calibration, rows[beside]).values
-    covariance_difference = certain.covariance - certain.moves_covariance
-    share = np.diag(covariance_difference)
-    largest_absolute_shift = float(np.abs(shift).max())
-    share_root = np.sqrt(np.abs(share))
-    assert share_root == pytest.approx(np.abs(shift), rel=0.03, abs=0.03 * largest_absolute_shift)
+
+    certain = weigh_rows(with_error, rows[beside])
+    at_values = weigh_rows(calibration, rows[beside])
+    at_error = weigh_rows(moved, rows[beside])
+
+    covariance_of_error = certain.covariance - certain.moves_covariance
+    share = np.diag(covariance_of_error)
+    shift = np.abs(at_error.values - at_values.values)
+    smallest = 0.03 * float(shift.max())
+    share_std = np.sqrt(np.abs(share))
+    assert share_std == pytest.approx(shift, rel=0.03, abs=smallest)
 
 
 @pytest.mark.slow
@@ -130,24 +160,22 @@ def test_the_tolerance_of_the_reference_mass_is_in_sigma_as_a_wrong_mass_is_in_t
     factor = 1.002
     tolerance_kg = (factor - 1.0) * reference.mass_kg
     heavier = weighed_cell(small_truth, 0, mass_factor=factor).calibration
-    shift = weigh_rows(heavier, rows[beside]).values - weigh_rows(calibration, rows[beside]).values
-    payload_mass = (reference.weighed_to(tolerance_kg),)
-    tolerant = replace(calibration, payload_mass=payload_mass)
-    changed_payload_mass = replace(tolerant.payload_mass[0], parameters_per_kg=())
-    earlier = replace(calibration, payload_mass=(changed_payload_mass,))
     exact = weigh_rows(calibration, rows[beside])
+    with_other_mass = weigh_rows(heavier, rows[beside])
+    shift = np.abs(with_other_mass.values - exact.values)
+    smallest = 0.02 * shift.max()
+    payload_mass = reference.weighed_to(tolerance_kg)
+    tolerant = replace(calibration, payload_mass=(payload_mass,))
+    without_derivatives = replace(payload_mass, parameters_per_kg=())
+    earlier = replace(calibration, payload_mass=(without_derivatives,))
     for known in (tolerant, earlier):
         found = weigh_rows(known, rows[beside])
         added = found.covariance - exact.covariance
         assert found.reference_covariance == pytest.approx(added)
-        added_diagonal_root = np.sqrt(np.diag(added))
-        largest_absolute_shift = np.abs(shift).max()
-        assert added_diagonal_root == pytest.approx(
-            np.abs(shift), rel=0.05, abs=0.02 * largest_absolute_shift
-        )
-        assert found.mass_reference_std_kg == pytest.approx(
-            tolerance_kg / reference.mass_kg * exact.mass_kg, rel=0.02
-        )
+        added_std = np.sqrt(np.diag(added))
+        assert added_std == pytest.approx(shift, rel=0.05, abs=smallest)
+        mass_std_kg = tolerance_kg / reference.mass_kg * exact.mass_kg
+        assert found.mass_reference_std_kg == pytest.approx(mass_std_kg, rel=0.02)
     assert exact.mass_reference_std_kg == 0.0
 
 
@@ -162,21 +190,26 @@ def test_a_payload_of_exact_mass_hides_no_tolerance_of_another(
     changed_calibration = replace(calibration, payload_mass=(tolerant,))
     alone = weigh_rows(changed_calibration, rows[0])
     for both in ((exact, tolerant), (tolerant, exact)):
-        found = weigh_rows(replace(calibration, payload_mass=both), rows[0])
+        with_both = replace(calibration, payload_mass=both)
+        found = weigh_rows(with_both, rows[0])
         assert found.reference_covariance == pytest.approx(alone.reference_covariance)
     assert alone.mass_reference_std_kg > 0.0
 
 
 def _changed(calibration: Calibration, values: FloatArray) -> Calibration:
     count = len(calibration.gains)
-    pairs = zip(calibration.gains, values[:count], strict=True)
-    rest = zip(calibration.parameters, values[count:], strict=True)
-    gains = tuple(replace(gain, value=float(value)) for gain, value in pairs)
-    parameters = tuple(replace(parameter, value=float(value)) for parameter, value in rest)
+    gains = []
+    values_of_gains = values[:count]
+    values_of_parameters = values[count:]
+    for gain, value in zip(calibration.gains, values_of_gains, strict=True):
+        gains.append(replace(gain, value=float(value)))
+    parameters = []
+    for parameter, value in zip(calibration.parameters, values_of_parameters, strict=True):
+        parameters.append(replace(parameter, value=float(value)))
     return replace(
         calibration,
-        gains=gains,
-        parameters=parameters,
+        gains=tuple(gains),
+        parameters=tuple(parameters),
     )
 
 
@@ -187,13 +220,25 @@ def test_a_common_error_of_the_gains_scales_the_body_and_leaves_its_centre(
     the scatter of the moves is left alone.
     """
     plain = _without_effects(cells[0].calibration)
-    gains = tuple(replace(gain, value=1.05 * gain.value) for gain in plain.gains)
-    scaled = replace(plain, gains=gains)
-    changed_gains = tuple(replace(gain, std=0.02 * abs(gain.value)) for gain in plain.gains)
-    uncertain = replace(plain, gains=changed_gains)
-    exact, heavier, found = (weigh_rows(one, rows[1]) for one in (plain, scaled, uncertain))
-    assert heavier.mass_kg == pytest.approx(1.05 * exact.mass_kg, rel=1e-3)
-    assert heavier.centre_m[0] == pytest.approx(exact.centre_m[0], abs=1e-5)
+    larger_gains = []
+    uncertain_gains = []
+    for gain in plain.gains:
+        value = 1.05 * gain.value
+        std = 0.02 * abs(gain.value)
+        larger_gains.append(replace(gain, value=value))
+        uncertain_gains.append(replace(gain, std=std))
+    scaled = replace(plain, gains=tuple(larger_gains))
+    uncertain = replace(plain, gains=tuple(uncertain_gains))
+
+    exact = weigh_rows(plain, rows[1])
+    heavier = weigh_rows(scaled, rows[1])
+    found = weigh_rows(uncertain, rows[1])
+
+    scaled_kg = 1.05 * exact.mass_kg
+    assert heavier.mass_kg == pytest.approx(scaled_kg, rel=1e-3)
+    centre_m, _ = exact.centre_m
+    centre_of_heavier_m, _ = heavier.centre_m
+    assert centre_of_heavier_m == pytest.approx(centre_m, abs=1e-5)
     assert not found.complete
     assert found.mass_std_kg >= 0.02 * found.mass_kg
     assert found.moves_covariance == pytest.approx(exact.moves_covariance)
@@ -206,10 +251,9 @@ def test_what_the_logs_say_of_their_payload_is_ignored(
     calibration = _without_effects(cell.calibration)
     payload = Payload("other", "elsewhere", {"m": 99.0})
     changed_loaded = replace(cell.loaded, payload=payload)
-    runs = cell.loaded, changed_loaded
-    first, second = (
-        weigh(calibration, small_truth.model, [run], cell.conditioning) for run in runs
-    )
+    model = small_truth.model
+    first = weigh(calibration, model, [cell.loaded], cell.conditioning)
+    second = weigh(calibration, model, [changed_loaded], cell.conditioning)
     assert first.values.tolist() == second.values.tolist()
 
 
@@ -219,33 +263,36 @@ def test_a_swing_of_the_last_joint_shows_a_part_and_says_what_would_show_the_res
     cell = cells[0]
     model = small_truth.model
     rng = np.random.default_rng(1)
-    calm = _only_last(small_truth, noisy_run(small_truth, "swing", rng, None, 24.0))
+    swing = noisy_run(small_truth, "swing", rng, None, 24.0)
+    calm = _only_last(small_truth, swing)
     loaded = _recorded(small_truth, calm, cell.body)
     calibration = _without_effects(cell.calibration)
     found = weigh(calibration, model, [loaded], cell.conditioning)
-    seen = dict(zip(LINK_PARAMETERS, found.identifiable.tolist(), strict=True))
+    identifiable = found.identifiable.tolist()
+    seen = dict(zip(LINK_PARAMETERS, identifiable, strict=True))
     assert not seen["m"]
-    expected = np.isnan(found.centre_m[0]).all()
-    assert np.isnan(found.mass_kg) == expected
+    centre_m, _ = found.centre_m
+    centre_is_unknown = np.isnan(centre_m).all()
+    assert np.isnan(found.mass_kg) == centre_is_unknown
     assert seen["mx"] or seen["mz"]  # the weight's lever about the last joint
 
     def extra(words: str, run: Run) -> ExtraMoves:
-        q = run.position_rad[::5]
         rate_hz = run.rate_hz / 5.0
-        velocity = np.gradient(q, axis=0) * rate_hz
-        velocity_gradient = np.gradient(velocity, axis=0)
-        acceleration_rad_s2 = velocity_gradient * rate_hz
-        motion = Motion(q, velocity, acceleration_rad_s2)
-        excitation = Excitation(motion, (np.abs(velocity) > 0.03).T)
+        motion = _motion(run.position_rad[::5], rate_hz)
+        is_moving = np.abs(motion.velocity_rad_s) > 0.03
+        excitation = Excitation(motion, is_moving.T)
         return ExtraMoves(words, 24.0, excitation)
 
     everything = extra("all axes", cell.loaded)
     same = extra("more of the same", calm)
-    helped = {one.name: one for one in moves_that_help(found, [same, everything])}
-    assert helped["m"].words == "all axes"
-    std = helped["m"].std
-    assert 2.0 * std < cell.body[-1]
-    assert "m" not in {one.name for one in moves_that_help(found, [same])}
+    helping = moves_that_help(found, [same, everything])
+    (of_mass,) = [one for one in helping if one.name == "m"]
+    assert of_mass.words == "all axes"
+    mass_kg = cell.body[-1]
+    assert 2.0 * of_mass.std < mass_kg
+    helping = moves_that_help(found, [same])
+    helped_names = {one.name for one in helping}
+    assert "m" not in helped_names
     assert moves_that_help(found, []) == ()
 
 
@@ -257,19 +304,16 @@ def _only_last(truth: Truth, run: Run) -> Run:
 
 def _recorded(truth: Truth, run: Run, body: FloatArray) -> Run:
     """The run with the currents that its motion needs."""
-    rate_hz = run.rate_hz
-    position_rad_gradient = np.gradient(run.position_rad, axis=0)
-    velocity = position_rad_gradient * rate_hz
-    velocity_gradient = np.gradient(velocity, axis=0)
-    acceleration_rad_s2 = velocity_gradient * rate_hz
-    motion = Motion(run.position_rad, velocity, acceleration_rad_s2)
+    motion = _motion(run.position_rad, run.rate_hz)
     parameters = truth.parameters.copy()
     parameters[truth.model.flange] += body
     torque = truth.model.torques(motion, parameters)[2]
     rng = np.random.default_rng(2)
-    noise = 0.02 * rng.standard_normal(torque.shape)
-    to_motor = truth.model.drive_train.to_motor
-    return replace(run, current_a=(to_motor @ torque / truth.gains[:, None] + noise).T)
+    noise_a = 0.02 * rng.standard_normal(torque.shape)
+    motor_torque = truth.model.drive_train.to_motor @ torque
+    predicted_a = motor_torque.T / truth.gains
+    current_a = predicted_a + noise_a.T
+    return replace(run, current_a=current_a)
 
 
 def test_too_little_is_refused(small_truth: Truth, cells: tuple[WeighedCell, ...]) -> None:
@@ -277,8 +321,12 @@ def test_too_little_is_refused(small_truth: Truth, cells: tuple[WeighedCell, ...
     with pytest.raises(DataUnfit, match="no run with the body"):
         weigh(cell.calibration, small_truth.model, [], cell.conditioning)
     end = round(6.0 * cell.loaded.rate_hz)
-    arrays = ("time_s", "position_rad", "current_a")
-    short = replace(cell.loaded, **{name: getattr(cell.loaded, name)[:end] for name in arrays})
+    names = ("time_s", "position_rad", "current_a")
+    arrays = {}
+    for name in names:
+        samples = getattr(cell.loaded, name)
+        arrays[name] = samples[:end]
+    short = replace(cell.loaded, **arrays)
     with pytest.raises(TooFewMoves):
         weigh(cell.calibration, small_truth.model, [short], cell.conditioning)
 
@@ -295,48 +343,68 @@ def test_centre_and_inertia_are_those_of_the_ten(seed: int) -> None:
     scale = Scale.__new__(Scale)
     error = RelativeError((), 0.0)
     found = WeighedBody(ten, certain, spread, True, 9, error, scale)
-    (centre, centre_std), (inertia, inertia_std) = found.centre_m, found.inertia_kg_m2
+    centre, centre_std = found.centre_m
+    inertia, inertia_std = found.inertia_kg_m2
     upper = np.triu_indices(3)
     body = body_of(ten)
     near = body_of(ten + step)
-    rotation = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    translation_m = np.array([0.4, 0.1, 0.0])
-    frame = Place(0, rotation, translation_m)
-    placed, placed_std = found.centre_in(frame)
+
     x, y, z = body.centre_m
-    assert placed == pytest.approx([y - 0.1, 0.4 - x, z])  # a quarter turn about z
-    assert placed_std == pytest.approx(centre_std[[1, 0, 2]])
-    planar = replace(found, values=np.where(np.arange(10) == 8, np.nan, ten))  # no mz, so no z
-    assert planar.centre_in(frame)[0] == pytest.approx([y - 0.1, 0.4 - x, np.nan], nan_ok=True)
+    quarter_turn_about_z = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    translation_m = np.array([0.4, 0.1, 0.0])
+    frame = Place(0, quarter_turn_about_z, translation_m)
+    placed, placed_std = found.centre_in(frame)
+    x_in_frame = y - 0.1
+    y_in_frame = 0.4 - x
+    assert placed == pytest.approx([x_in_frame, y_in_frame, z])
+    std_in_frame = centre_std[[1, 0, 2]]
+    assert placed_std == pytest.approx(std_in_frame)
+
+    without_mz = ten.copy()
+    without_mz[8] = np.nan
+    planar = replace(found, values=without_mz)
+    placed, _ = planar.centre_in(frame)
+    assert placed == pytest.approx([x_in_frame, y_in_frame, np.nan], nan_ok=True)
+
     assert centre == pytest.approx(body.centre_m)
-    assert inertia == pytest.approx(body.inertia_kg_m2[upper], abs=1e-12)
-    centre_difference_m = np.abs(near.centre_m - body.centre_m)
-    assert centre_std == pytest.approx(centre_difference_m, rel=1e-2, abs=1e-9)
-    inertia_difference_kg_m2 = np.abs(near.inertia_kg_m2 - body.inertia_kg_m2)
-    assert inertia_std == pytest.approx(inertia_difference_kg_m2[upper], rel=1e-2, abs=1e-9)
-    lost = replace(found, values=np.where(np.arange(10) == 6, np.nan, ten))
-    assert np.isnan(lost.centre_m[0]).tolist() == [True, False, False]
+    inertia_kg_m2 = body.inertia_kg_m2[upper]
+    assert inertia == pytest.approx(inertia_kg_m2, abs=1e-12)
+    centre_step_m = np.abs(near.centre_m - body.centre_m)
+    assert centre_std == pytest.approx(centre_step_m, rel=1e-2, abs=1e-9)
+    near_kg_m2 = near.inertia_kg_m2[upper]
+    inertia_step_kg_m2 = np.abs(near_kg_m2 - inertia_kg_m2)
+    assert inertia_std == pytest.approx(inertia_step_kg_m2, rel=1e-2, abs=1e-9)
+
+    without_mx = ten.copy()
+    without_mx[6] = np.nan
+    lost = replace(found, values=without_mx)
+    centre, _ = lost.centre_m
+    assert np.isnan(centre).tolist() == [True, False, False]
 
 
 def test_a_parameter_with_a_long_lever_is_identified_though_a_compact_body_has_less() -> None:
     """Izz of 5 kg, 0.45 m from the joint, known to 2 %:
     twice σ is more than a steel cube of that mass has.
     """
-    ten = np.array([np.nan, np.nan, np.nan, np.nan, np.nan, 1.0, 2.2, 0.01, np.nan, 5.0])
+    nan = np.nan
+    ten = np.array([nan, nan, nan, nan, nan, 1.0, 2.2, 0.01, nan, 5.0])
+    names = np.array(LINK_PARAMETERS)
 
     def identified(std_of_izz: float) -> list[str]:
-        std = np.where(np.isnan(ten), np.nan, 0.01)
+        std = np.where(np.isnan(ten), nan, 0.01)
         std[5] = std_of_izz
         covariance = np.diag(std**2)
-        error = RelativeError((), 0.0)
-        body = WeighedBody(ten, covariance, covariance, True, 9, error, Scale.__new__(Scale))
-        return [
-            name for name, known in zip(LINK_PARAMETERS, body.identifiable, strict=True) if known
-        ]
+        body = _body_of(ten, covariance)
+        found: list[str] = names[body.identifiable].tolist()
+        return found
 
-    assert 2.0 * 0.02 > 5.0 * (5.0 / 7850.0) ** (2.0 / 3.0)
+    std_of_izz = 0.02
+    volume_of_cube_m3 = 5.0 / 7850.0
+    side_of_cube_m = volume_of_cube_m3 ** (1.0 / 3.0)
+    inertia_of_cube = 5.0 * side_of_cube_m**2
+    assert 2.0 * std_of_izz > inertia_of_cube
     # `my` is near zero, and known to less than the cube's
-    assert identified(0.02) == ["Izz", "mx", "my", "m"]
+    assert identified(std_of_izz) == ["Izz", "mx", "my", "m"]
     assert identified(0.2) == ["mx", "my", "m"]
 
 
@@ -350,11 +418,11 @@ def test_a_mass_is_identified_to_a_tenth_of_itself_and_nothing_is_small_beside_a
     std = np.full(10, 1e-4 * mass_kg)
     std[9] = share * mass_kg
     covariance = np.diag(std**2)
-    error = RelativeError((), 0.0)
-    body = WeighedBody(ten, covariance, covariance, True, 9, error, Scale.__new__(Scale))
+    body = _body_of(ten, covariance)
     known = body.identifiable
     assert known[9] == (share <= KNOWN)
-    least = body.size
-    assert known[:9].tolist() == (2.0 * std < least)[:9].tolist()
+    is_precise = 2.0 * std < body.size
+    others_known = known[:9].tolist()
+    assert others_known == is_precise[:9].tolist()
     if share > 0.5:
         assert not known.any()

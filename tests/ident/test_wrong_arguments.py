@@ -196,7 +196,10 @@ def test_identify_the_same_mistake_in_every_run_is_refused(
 def test_angles_in_other_units_are_named_with_how_far_the_joint_turns(
     small_truth: Truth, short: tuple[ident.Run, ident.Run], factors: FloatArray
 ) -> None:
-    runs = [replace(run, position_rad=np.asarray(run.position_rad) * factors) for run in short]
+    runs = []
+    for run in short:
+        position_rad = np.asarray(run.position_rad) * factors
+        runs.append(replace(run, position_rad=position_rad))
     words = (
         r"axis q\d: found positions that move by \d+\.?\d* rad; expected at most 6 rad, the travel "
         r"of this joint in the URDF; are these degrees .*, or the motor's angle before the gear"
@@ -218,14 +221,20 @@ def test_angles_in_other_units_are_named_with_how_far_the_joint_turns(
 def test_a_range_or_current_of_a_robot_is_not_taken_for_other_units(
     small_truth: Truth, short: tuple[ident.Run, ident.Run]
 ) -> None:
-    channels = [
-        channels_of(small_truth.model, differentiate(run, small_truth.model.drive_train))
-        for run in short
-    ]
+    model = small_truth.model
+    channels = []
+    for run in short:
+        data = differentiate(run, model.drive_train)
+        channels.append(channels_of(model, data))
     axes = ("J1", "J2", "J3")
-    assert unlikely_units(channels, small_truth.model, axes) == ""
-    in_milliamperes = [replace(one, limits=1000.0 * one.limits) for one in channels]
-    assert "are these milliamperes" in unlikely_units(in_milliamperes, small_truth.model, axes)
+    assert unlikely_units(channels, model, axes) == ""
+
+    in_milliamperes = []
+    for one in channels:
+        limits = 1000.0 * one.limits
+        in_milliamperes.append(replace(one, limits=limits))
+    found = unlikely_units(in_milliamperes, model, axes)
+    assert "are these milliamperes" in found
 
 
 Call = Callable[[Any, Any], Any]
@@ -492,7 +501,8 @@ def test_a_recording_that_is_given_twice_is_refused_with_both_roles(
         ident.identify(model, [bare, again, loaded])
     with pytest.raises(ident.DataUnfit, match=words):
         ident.identify(model, short, holdout=[again])
-    with pytest.raises(ident.DataUnfit, match=rf"with payload 'disc', {first}; {remedy}"):
+    words = rf"with payload 'disc', {first}; {remedy}"
+    with pytest.raises(ident.DataUnfit, match=words):
         ident.identify(model, [bare, as_loaded])
 
 
@@ -500,25 +510,32 @@ def test_one_recording_may_be_split_into_fit_and_hold_out_by_its_valid_samples(
     small_truth: Truth, short: tuple[ident.Run, ident.Run]
 ) -> None:
     bare, loaded = short
-    is_of_fit = np.arange(len(bare.time_s)) < len(bare.time_s) * 2 // 3
-    is_first = np.repeat(is_of_fit[:, None], bare.position_rad.shape[1], axis=1)
+    is_first = np.zeros(bare.position_rad.shape, dtype=bool)
+    count = len(bare.time_s)
+    is_first[: count * 2 // 3] = True
     of_fit = replace(bare, valid=is_first)
     held_out = replace(bare, name="the rest", valid=~is_first)
-    found = ident.identify(small_truth.model, [of_fit, loaded], holdout=[held_out])
+    model = small_truth.model
+    found = ident.identify(model, [of_fit, loaded], holdout=[held_out])
     assert found.holdout is not None
 
 
 @pytest.mark.slow
 def test_a_method_may_be_named(small_truth: Truth, short: tuple[ident.Run, ident.Run]) -> None:
+    model = small_truth.model
+    conditioning = ident.Conditioning()
     for method in ident.Method:
-        found = ident.identify(small_truth.model, short, ident.Conditioning(), method=method.value)
+        found = ident.identify(model, short, conditioning, method=method.value)
         assert found.estimate.method is method
 
 
 def test_several_runs_are_named_one_by_one(
     small_truth: Truth, short: tuple[ident.Run, ident.Run]
 ) -> None:
-    still = [replace(run, position_rad=run.position_rad * [1.0, 0.0, 1.0]) for run in short]
+    still = []
+    for run in short:
+        position_rad = run.position_rad * [1.0, 0.0, 1.0]
+        still.append(replace(run, position_rad=position_rad))
     with pytest.raises(ident.DataUnfit, match=r"^runs bare, loaded: axis q1: found q1 never moves"):
         ident.identify(small_truth.model, still, ident.Conditioning())
 
@@ -529,8 +546,11 @@ def test_lists_and_arrays_of_objects_or_without_a_masked_value_are_as_good(
     run = short[0]
     train = DRIVE_TRAIN
     expected = ident.differentiate(run, train)
-    for kind in (np.ma.masked_array, lambda values: values.astype(object), np.ndarray.tolist):
-        current_a = kind(run.current_a)
+    values = np.asarray(run.current_a)
+    without_mask = np.ma.masked_array(values)
+    of_objects = values.astype(object)
+    lists = values.tolist()
+    for current_a in (without_mask, of_objects, lists):
         changed_run = replace(run, current_a=current_a)
         same = ident.differentiate(changed_run, train)
         assert np.array_equal(same.current_a, expected.current_a)
@@ -539,31 +559,36 @@ def test_lists_and_arrays_of_objects_or_without_a_masked_value_are_as_good(
 @pytest.fixture(scope="module")
 def arguments(small_truth: Truth, short: tuple[ident.Run, ident.Run]) -> dict[str, Any]:
     """Right arguments of the public functions, by their names."""
-    found = ident.identify(small_truth.model, short, ident.Conditioning())
+    model = small_truth.model
+    conditioning = ident.Conditioning()
+    found = ident.identify(model, short, conditioning)
+    gains = found.estimate.gains
     axes = ("J1", "J2", "J3")
-    calibration = ident.calibration_of(found, axes, found.estimate.gains)
-    data = ident.differentiate(short[0], small_truth.model.drive_train)
-    current_a = short[0].current_a
+    calibration = ident.calibration_of(found, axes, gains)
+    bare, loaded = short
+    data = ident.differentiate(bare, model.drive_train)
+    motion = data.motion()
+    rng = np.random.default_rng(0)
     return {
         "calibration": calibration,
-        "model": small_truth.model,
+        "model": model,
         "data": data,
-        "run": short[0],
+        "run": bare,
         "runs": short,
-        "loaded": short[1:],
-        "quiet": short[:1],
-        "current_a": current_a,
+        "loaded": (loaded,),
+        "quiet": (bare,),
+        "current_a": bare.current_a,
         "found": found,
         "axes": axes,
-        "nameplate": found.estimate.gains,
-        "motion": data.motion(),
+        "nameplate": gains,
+        "motion": motion,
         "rate_hz": 500.0,
-        "drive_train": small_truth.model.drive_train,
-        "conditioning": ident.Conditioning(),
+        "drive_train": model.drive_train,
+        "conditioning": conditioning,
         "instants": found.instants,
-        "gains": found.estimate.gains,
+        "gains": gains,
         "start": None,
-        "rng": np.random.default_rng(0),
+        "rng": rng,
     }
 
 
@@ -584,7 +609,8 @@ FUNCTIONS = (
     "find_effects",
     "gather",
 )
-WRONG_VALUES: tuple[Any, ...] = (3.5, "words", object(), {"a": 1}, ["x", "y"], 1j * np.ones((4, 3)))
+COMPLEX = 1j * np.ones((4, 3))
+WRONG_VALUES: tuple[Any, ...] = (3.5, "words", object(), {"a": 1}, ["x", "y"], COMPLEX)
 
 
 @pytest.mark.parametrize("function", FUNCTIONS)
@@ -592,15 +618,15 @@ def test_no_public_function_has_a_traceback_for_an_argument_of_another_type(
     arguments: dict[str, Any], function: str
 ) -> None:
     called = getattr(lax, function)
-    parameters = inspect.signature(called).parameters
-    needed = [one.name for one in parameters.values() if one.default is one.empty]
-    if function != "gather":
-        right = [arguments[name] for name in needed]
+    if function == "gather":
+        needed = ["found", "runs"]
     else:
-        right = [arguments["found"], arguments["runs"]]
-    for place in range(len(right)):
+        parameters = inspect.signature(called).parameters.values()
+        needed = [one.name for one in parameters if one.default is one.empty]
+    right = [arguments[name] for name in needed]
+    for place, name in enumerate(needed):
         for value in WRONG_VALUES:
-            if needed[place:] and needed[place] == "rate_hz" and isinstance(value, float):
+            if name == "rate_hz" and isinstance(value, float):
                 continue  # it is one
             wrong = list(right)
             wrong[place] = value
@@ -656,19 +682,24 @@ def test_a_calibration_of_odd_axes_is_refused(
 def test_the_tolerance_of_a_payloads_mass_is_that_of_a_cell_file(
     small_truth: Truth, short: tuple[ident.Run, ident.Run], arguments: dict[str, Any]
 ) -> None:
+    model = small_truth.model
+    axes = arguments["axes"]
+    nameplate = arguments["nameplate"]
+    exact_calibration = arguments["calibration"]
+    bare, loaded = short
     declared = replace(MOUNTED, mass_tolerance_kg=0.02)
-    changed_short = replace(short[1], payload=declared)
-    found = ident.identify(small_truth.model, [short[0], changed_short], ident.Conditioning())
-    calibration = ident.calibration_of(found, arguments["axes"], arguments["nameplate"])
+    with_tolerance = replace(loaded, payload=declared)
+    found = ident.identify(model, [bare, with_tolerance], ident.Conditioning())
+    calibration = ident.calibration_of(found, axes, nameplate)
     # What `daq.calibration_of` does with `mass_tolerance_kg` of the cell file
-    payload_mass = arguments["calibration"].payload_mass
+    payload_mass = exact_calibration.payload_mass
     by_cell_file = [one.weighed_to(0.02) for one in payload_mass]
     assert list(calibration.payload_mass) == by_cell_file
     gains = calibration.payload_mass[0].gains
     assert gains[1].tolerance_std > 0.0
-    body = ident.weigh(calibration, small_truth.model, short[1:])
+    body = ident.weigh(calibration, model, [loaded])
     assert body.mass_reference_std_kg == pytest.approx(0.02, rel=0.1)
-    exact = ident.weigh(arguments["calibration"], small_truth.model, short[1:])
+    exact = ident.weigh(exact_calibration, model, [loaded])
     assert exact.mass_reference_std_kg == 0.0
 
 
@@ -723,15 +754,18 @@ def test_runs_that_are_not_those_of_the_fit_are_refused_by_gather(
 ) -> None:
     found = replace(arguments["found"], gathered=None)
     bare, loaded = arguments["runs"]
-    with pytest.raises(ident.ModelError, match=rf"was given {bare.name}; expected the runs of the"):
+    words = rf"was given {bare.name}; expected the runs of the"
+    with pytest.raises(ident.ModelError, match=words):
         ident.gather(found, [bare])
     with pytest.raises(ident.ModelError, match="gather was given no runs; expected the runs of"):
         ident.gather(found)
     renamed = replace(loaded, name="yesterday")
-    with pytest.raises(ident.ModelError, match=rf"was given {bare.name}, yesterday; expected"):
+    words = rf"was given {bare.name}, yesterday; expected"
+    with pytest.raises(ident.ModelError, match=words):
         ident.gather(found, [bare, renamed])
+    held_out = replace(bare, name="held out")
     with pytest.raises(ident.DataUnfit, match="found the same samples, without load, as in run"):
-        ident.gather(found, [bare, loaded], [replace(bare, name="held out")])
+        ident.gather(found, [bare, loaded], [held_out])
 
 
 def test_a_held_out_run_with_another_payload_is_refused_by_gather(
@@ -740,12 +774,17 @@ def test_a_held_out_run_with_another_payload_is_refused_by_gather(
     found = replace(arguments["found"], gathered=None)
     bare, loaded = arguments["runs"]
     mounted = loaded.payload
-    shifted = replace(loaded, position_rad=loaded.position_rad + 0.01)
-    on_wall = _carrying(shifted, replace(mounted, mounting="wall"))
+    position_rad = loaded.position_rad + 0.01
+    shifted = replace(loaded, position_rad=position_rad)
+    to_wall = replace(mounted, mounting="wall")
+    on_wall = _carrying(shifted, to_wall)
     with pytest.raises(ident.DataUnfit, match="held out with mounting 'wall', which no run of the"):
         ident.gather(found, [bare, loaded], [on_wall])
-    heavier = _carrying(shifted, replace(mounted, known={"m": 2.0 * mounted.known["m"]}))
-    with pytest.raises(ident.DataUnfit, match=f"mounting {mounted.mounting!r} carries"):
+    mass_kg = 2.0 * mounted.known["m"]
+    heavy = replace(mounted, known={"m": mass_kg})
+    heavier = _carrying(shifted, heavy)
+    words = f"mounting {mounted.mounting!r} carries"
+    with pytest.raises(ident.DataUnfit, match=words):
         ident.gather(found, [bare, loaded], [heavier])
 
 
@@ -766,8 +805,10 @@ def test_sampling_rates_that_are_none_are_refused(rates_hz: Any) -> None:
     ],
 )
 def test_settings_of_a_filter_that_are_no_numbers_are_refused(changed: dict[str, Any]) -> None:
-    document = {**ident.Conditioning().document(), **changed}
-    with pytest.raises(ident.ModelError, match=f"{next(iter(changed))} of the .* is "):
+    right = ident.Conditioning().document()
+    document = {**right, **changed}
+    (setting,) = changed
+    with pytest.raises(ident.ModelError, match=f"{setting} of the .* is "):
         ident.Conditioning.of_document(document)
 
 
@@ -775,17 +816,21 @@ def test_settings_of_a_filter_that_are_no_numbers_are_refused(changed: dict[str,
 def test_limits_that_no_robot_has_are_refused(arguments: dict[str, Any], name: str) -> None:
     ones = np.ones(3)
     limits = {"lower": -ones, "upper": ones, "velocity": ones, "acceleration": 2.0 * ones}
-    limits[name] = -1e300 * ones if name == "lower" else 1e300 * ones
-    with pytest.raises(ident.ModelError, match=rf"limits\.{name} has .*; expected at most 1e\+30"):
-        _planned(arguments, limits=ident.JointLimits(**limits))
+    sign = -1.0 if name == "lower" else 1.0
+    limits[name] = sign * 1e300 * ones
+    joint_limits = ident.JointLimits(**limits)
+    words = rf"limits\.{name} has .*; expected at most 1e\+30"
+    with pytest.raises(ident.ModelError, match=words):
+        _planned(arguments, limits=joint_limits)
 
 
 def test_a_gain_of_zero_is_refused_before_the_geometry_is_judged(
     arguments: dict[str, Any],
 ) -> None:
+    model = arguments["model"]
     instants = arguments["found"].instants
     with pytest.raises(ident.ModelError, match=r"gains is \[0.0, 1.0, 2.0\]; expected no zero"):
-        ident.find_turned_geometry(arguments["model"], instants, [0, 1, 2])
+        ident.find_turned_geometry(model, instants, [0, 1, 2])
 
 
 def test_gains_by_name_are_told_how_to_become_a_list(arguments: dict[str, Any]) -> None:
@@ -803,16 +848,20 @@ def test_gains_by_name_are_told_how_to_become_a_list(arguments: dict[str, Any]) 
 def _planned(arguments: dict[str, Any], **changed: Any) -> Any:
     """A plan without tries, with some arguments changed."""
     ones = np.ones(3)
+    model = arguments["model"]
+    limits = ident.JointLimits(-ones, ones, ones, 2.0 * ones)
+    nameplate = 20.0 * ones
     usual = {
-        "model": arguments["model"],
-        "limits": ident.JointLimits(-ones, ones, ones, 2.0 * ones),
+        "model": model,
+        "limits": limits,
         "payload": MOUNTED,
-        "nameplate": 20.0 * ones,
+        "nameplate": nameplate,
         "urdf": THREE_AXES.urdf,
         "duration_s": 30.0,
         "exchanges": 0,
     }
-    return lax.plan_moves(**{**usual, **changed})
+    usual.update(changed)
+    return lax.plan_moves(**usual)
 
 
 def _with_joint(arguments: dict[str, Any], **changed: Any) -> ident.Model:
@@ -833,20 +882,20 @@ def _searched(arguments: dict[str, Any], **changed: Any) -> Any:
 def _external(arguments: dict[str, Any], **changed: Any) -> Any:
     """External torque with a band of which some numbers are changed."""
     ones = np.ones(3)
+    scale = np.ones((3, 4))
     band = ident.Band(
-        scale=np.ones((3, 4)),
+        scale=scale,
         factor=ones,
         threshold=ones,
         correlation_s=ones,
         quiet_s=ones,
         alarms_per_hour=1.0,
     )
-    return ident.external_torque(
-        arguments["calibration"],
-        arguments["model"],
-        arguments["run"],
-        band=replace(band, **changed),
-    )
+    changed_band = replace(band, **changed)
+    calibration = arguments["calibration"]
+    model = arguments["model"]
+    run = arguments["run"]
+    return ident.external_torque(calibration, model, run, band=changed_band)
 
 
 def _predicted(arguments: dict[str, Any], **changed: Any) -> FloatArray:
@@ -858,8 +907,10 @@ def _predicted(arguments: dict[str, Any], **changed: Any) -> FloatArray:
 
 def _turned(arguments: dict[str, Any], **changed: Any) -> Any:
     """A judgement of the geometry by rows of which some are changed."""
+    model = arguments["model"]
+    gains = arguments["gains"]
     instants = replace(arguments["instants"][0], **changed)
-    return ident.find_turned_geometry(arguments["model"], [instants], arguments["gains"])
+    return ident.find_turned_geometry(model, [instants], gains)
 
 
 WITH_ROBOT = lax.robot_from_urdf

@@ -7,7 +7,8 @@ import json
 import shutil
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -30,6 +31,7 @@ from daq.report.bus_views import (
     NO_IDENTITY,
     OTHER_DRIVE,
     STOPPED,
+    ScannedNode,
     scan_report,
     scan_table,
     scan_view,
@@ -45,7 +47,7 @@ from drivers.messages import EventKind
 from drivers.profiles.profile import Identity
 from drivers.simulation.cell import SimulatedCell
 from drivers.simulation.drive import ErrorCode, PowerState
-from drivers.simulation.spec import SdoAbort
+from drivers.simulation.spec import CellSpec, SdoAbort
 from ident.model.model import DriveTrain
 from tests.daq.command_line import run_verb
 from tests.faults.test_scenario import PLAN
@@ -55,14 +57,45 @@ STOP_NODE = 2  #: Command of NMT (CiA 301)
 
 
 def _node(node_id: int, statusword: int | None, serial: int | None = None) -> FoundNode:
-    identity = Identity(0x29A, 0x40200, 1000 + node_id if serial is None else serial)
+    if serial is None:
+        serial = 1000 + node_id
+    identity = Identity(0x29A, 0x40200, serial)
     return FoundNode(node_id, identity, 1, "drive", 0x7F, statusword)
+
+
+def _nodes(node_ids: Iterable[int], statusword: int) -> tuple[FoundNode, ...]:
+    return tuple(_node(node_id, statusword) for node_id in node_ids)
+
+
+def _first_row(cell: Cell, node: FoundNode) -> ScannedNode:
+    """The row of the first axis, where only this node answers."""
+    rows = scanned_nodes(cell, (node,), "demo")
+    return rows[0]
+
+
+def _clean_simulation() -> CellSpec:
+    return load_simulation(shipped_simulation("clean"))
+
+
+@contextmanager
+def _simulated(cell: Cell) -> Iterator[SimulatedCell]:
+    """The cell on its bus, without a fault."""
+    with open_bus(bus_address(cell)) as bus, SimulatedCell(_clean_simulation(), bus) as simulated:
+        yield simulated
+
+
+def _copied_cell_file(checkout: Path, folder: Path) -> Path:
+    """The file of the demo cell, with all configurations in a folder of the test."""
+    configs = folder / "configs"
+    shutil.copytree(checkout / "configs", configs)
+    return configs / "cells/demo.yaml"
 
 
 def _shown(cell: Cell, nodes: tuple[FoundNode, ...], width: int) -> str:
     out = io.StringIO()
     console = Console(file=out, width=width, soft_wrap=True)
-    console.print(scan_table(scanned_nodes(cell, nodes, "demo")))
+    rows = scanned_nodes(cell, nodes, "demo")
+    console.print(scan_table(rows))
     return out.getvalue()
 
 
@@ -90,11 +123,8 @@ def test_an_enabled_axis_is_shouted(
     in_faults = [row.in_fault for row in rows]
     assert in_faults == [False, in_fault, *[False] * 4]
     verdicts = [row.verdict for row in rows]
-    assert verdicts == [
-        "ok",
-        "in fault" if in_fault else "ok",
-        *["missing"] * 4,
-    ]
+    verdict = "in fault" if in_fault else "ok"
+    assert verdicts == ["ok", verdict, *["missing"] * 4]
     for width in (40, 80, 200):
         text = _shown(cell, nodes, width)
         assert ("ENABLED" in text) is bool(enabled)
@@ -102,10 +132,11 @@ def test_an_enabled_axis_is_shouted(
 
 
 def test_a_narrow_terminal_gets_every_column_and_whole_words(cell: Cell) -> None:
-    nodes = tuple(_node(number, 0x237) for number in range(1, 7))
+    nodes = _nodes(range(1, 7), 0x237)
     for width in (50, 80, 200):
         text = _shown(cell, nodes, width)
-        assert max(cell_len(line.rstrip()) for line in text.splitlines()) <= width
+        line_widths = [cell_len(line.rstrip()) for line in text.splitlines()]
+        assert max(line_widths) <= width
         assert text.count("ENABLED") == 6
         assert text.count("pre-operational") == 6
         for number in range(1, 7):
@@ -125,14 +156,10 @@ def test_a_virtual_bus_without_a_cell_names_the_simulation(
 def test_a_scan_without_answers_does_not_advise_a_scan(
     checkout: Path, cell: Cell, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    configs = Path(shutil.copytree(checkout / "configs", tmp_path / "configs"))
-    file = configs / "cells/demo.yaml"
+    file = _copied_cell_file(checkout, tmp_path)
     changed_text = file.read_text().replace("node_id: 6", "node_id: 66")
     file.write_text(changed_text)
-    with (
-        open_bus(bus_address(cell)) as bus,
-        SimulatedCell(load_simulation(shipped_simulation("clean")), bus),
-    ):
+    with _simulated(cell):
         assert run_verb("scan", file, "--json") == ExitCode.DEVICE_FAULT
     failure = json.loads(capsys.readouterr().err)
     assert failure["kind"] == "NodeMissing"
@@ -145,13 +172,15 @@ def test_a_real_bus_without_a_node_names_the_wiring(cell: Cell) -> None:
     buses = (changed_buses,)
     real = replace(cell, buses=buses)
     axes = drive_axes(real)
-    assert "check power, wiring" in str(no_answer(real, axes, (), 0.5))
+    error = no_answer(real, axes, (), 0.5)
+    assert "check power, wiring" in str(error)
     # One answered: a cell is there
-    assert "check power, wiring" in str(no_answer(cell, axes[1:], (1,), 0.5))
+    error = no_answer(cell, axes[1:], (1,), 0.5)
+    assert "check power, wiring" in str(error)
 
 
 def test_a_message_names_the_axis_first(cell: Cell) -> None:
-    rows = scanned_nodes(cell, (_node(3, 0x237), _node(9, 0x237)), "demo")
+    rows = scanned_nodes(cell, _nodes((3, 9), 0x237), "demo")
     report = scan_report(cell, rows, {}, (), ())
     said = [str(part) for part in scan_view(report)]
     assert said[1].startswith("J3 (node 3) IS ENABLED")
@@ -159,8 +188,9 @@ def test_a_message_names_the_axis_first(cell: Cell) -> None:
 
 
 def test_identity_and_power_are_distinguished(cell: Cell) -> None:
-    (row, *_) = scanned_nodes(cell, (_node(1, 0x237, serial=9),), "demo")
-    assert (row.verdict, row.enabled) == ("other serial number", True)
+    row = _first_row(cell, _node(1, 0x237, serial=9))
+    assert row.verdict == "other serial number"
+    assert row.enabled is True
     assert row.remarks == [
         "serial number 1018h:04 is 9, the cell configuration expects 1001",
         OTHER_DRIVE,
@@ -172,19 +202,17 @@ def test_table_and_remarks_write_the_numbers_of_an_identity_alike(cell: Cell) ->
     other = FoundNode(1, identity, 1, "drive", 0x7F, 0x250)
     rows = scanned_nodes(cell, (other,), "demo")
     cells = _shown(cell, (other,), 200).split()
-    for number, expected in (("0x2", "0x29a"), ("0x3", "0x40200"), ("4", "1001")):
+    expected_numbers = {"0x2": "0x29a", "0x3": "0x40200", "4": "1001"}
+    for number, expected in expected_numbers.items():
         assert number in cells
-        remarks = rows[0].remarks
-        assert any(
-            f"is {number}, the cell configuration expects {expected}" in remark
-            for remark in remarks
-        )
+        words = f"is {number}, the cell configuration expects {expected}"
+        assert any(words in remark for remark in rows[0].remarks)
 
 
 def test_a_drive_without_the_declared_serial_number_is_not_said_to_have_zero(cell: Cell) -> None:
     identity = Identity(0x29A, None, None)
     silent = FoundNode(1, identity, 1, "drive", 0x7F, 0x250)
-    (row, *_) = scanned_nodes(cell, (silent,), "demo")
+    row = _first_row(cell, silent)
     assert row.verdict == "other product code"
     assert row.remarks[:2] == [
         "product code 1018h:02 is not reported, the cell configuration expects 0x40200",
@@ -203,40 +231,48 @@ def test_a_field_that_is_left_out_of_an_identity_is_not_compared(
     axes = (changed_axis, *cell.axes[1:])
     node = FoundNode(1, reported, 1, "drive", 0x7F, 0x250)
     changed_cell = replace(cell, axes=axes)
-    (row, *_) = scanned_nodes(changed_cell, (node,), "demo")
-    product_missing = identity == Identity(0x29A, 0x40200) and reported.product_code is None
-    assert row.verdict == ("other product code" if product_missing else "ok")
+    row = _first_row(changed_cell, node)
+    product_declared = identity == Identity(0x29A, 0x40200)
+    product_missing = product_declared and reported.product_code is None
+    verdict = "other product code" if product_missing else "ok"
+    assert row.verdict == verdict
 
 
 def test_a_cell_without_serial_does_not_compare_it(cell: Cell) -> None:
-    axes = tuple(
-        replace(axis, identity=axis.identity and replace(axis.identity, serial=None))
-        for axis in cell.axes
-    )
-    changed_cell = replace(cell, axes=axes)
-    (row, *_) = scanned_nodes(changed_cell, (_node(1, 0x250, serial=9),), "demo")
-    assert (row.verdict, row.remarks) == ("ok", [])
+    axes = []
+    for axis in cell.axes:
+        assert axis.identity is not None
+        identity = replace(axis.identity, serial=None)
+        axes.append(replace(axis, identity=identity))
+    changed_cell = replace(cell, axes=tuple(axes))
+    row = _first_row(changed_cell, _node(1, 0x250, serial=9))
+    assert row.verdict == "ok"
+    assert row.remarks == []
 
 
 def test_a_node_that_answers_no_request_is_remarked(cell: Cell) -> None:
     """The table alone said `no identity`, and no word what to do."""
     beating = FoundNode(1, None, None, None, 0x7F, None)
-    (row, *_) = scanned_nodes(cell, (beating,), "demo")
+    row = _first_row(cell, beating)
     assert row.verdict == "no identity"
     assert row.remarks == [NO_IDENTITY]
     overloaded = replace(beating, problems=("object 1018h:01: 64 answers to other requests",))
-    (row, *_) = scanned_nodes(cell, (overloaded,), "demo")
+    row = _first_row(cell, overloaded)
     assert row.remarks == list(overloaded.problems)
 
 
 def test_a_silent_axis_without_declared_identity_is_not_called_ok(cell: Cell) -> None:
-    axes = (replace(cell.axes[0], identity=None), *cell.axes[1:])
-    cell = replace(cell, axes=axes)
-    beating = FoundNode(1, None, None, None, NmtState.STOPPED, None, answers=False)
-    (row, *_) = scanned_nodes(cell, (beating,), "demo")
-    assert (row.verdict, row.remarks) == ("no identity", [STOPPED])
-    (row, *_) = scanned_nodes(cell, (replace(beating, nmt=NmtState.OPERATIONAL),), "demo")
-    assert (row.verdict, row.remarks) == ("no identity", [NO_ANSWER])
+    first, *others = cell.axes
+    without_identity = replace(first, identity=None)
+    cell = replace(cell, axes=(without_identity, *others))
+    stopped = FoundNode(1, None, None, None, NmtState.STOPPED, None, answers=False)
+    row = _first_row(cell, stopped)
+    assert row.verdict == "no identity"
+    assert row.remarks == [STOPPED]
+    operational = replace(stopped, nmt=NmtState.OPERATIONAL)
+    row = _first_row(cell, operational)
+    assert row.verdict == "no identity"
+    assert row.remarks == [NO_ANSWER]
 
 
 @pytest.mark.parametrize("silent", [(3,), (1, 2, 3, 4, 5, 6)], ids=["one", "every"])
@@ -247,13 +283,11 @@ def test_axes_that_only_send_heartbeats_are_no_success(
     silent: tuple[int, ...],
 ) -> None:
     """It ended with 0: the table said `no identity`, and nothing else did."""
-    with (
-        open_bus(bus_address(cell)) as bus,
-        SimulatedCell(load_simulation(shipped_simulation("clean")), bus) as simulated,
-    ):
+    heartbeat_ms = (20).to_bytes(2, "little")
+    with _simulated(cell) as simulated:
         for node in simulated.nodes:
             if node.node_id in silent:
-                node.write(0x1017, 0, (20).to_bytes(2, "little"))
+                node.write(0x1017, 0, heartbeat_ms)
                 node.command_nmt(STOP_NODE, 0.0)
         code = run_verb("scan", checkout / "configs/cells/demo.yaml", "--json")
     assert code == ExitCode.DEVICE_FAULT
@@ -261,10 +295,12 @@ def test_axes_that_only_send_heartbeats_are_no_success(
     failure = json.loads(printed.err)
     assert failure["kind"] == "NodeMissing"
     rows = json.loads(printed.out)["nodes"]
-    unanswering = [row["node_id"] for row in rows if row["remarks"] == [STOPPED]]
+    remarks = {row["node_id"]: row["remarks"] for row in rows}
+    unanswering = [node_id for node_id in remarks if remarks[node_id] == [STOPPED]]
     assert unanswering == list(silent)
+    found = failure["found"]
     for node_id in silent:
-        assert f"J{node_id} (node {node_id})" in failure["found"]
+        assert f"J{node_id} (node {node_id})" in found
 
 
 def test_a_foreign_node_that_only_sends_heartbeats_is_no_failure(
@@ -273,25 +309,22 @@ def test_a_foreign_node_that_only_sends_heartbeats_is_no_failure(
     """A device that is no axis may be without an SDO server."""
     operational = bytes([NmtState.OPERATIONAL])
     beat = can.Message(arbitration_id=0x700 + 77, data=operational, is_extended_id=False)
-    with (
-        open_bus(bus_address(cell)) as bus,
-        open_bus(bus_address(cell)) as foreign,
-        SimulatedCell(load_simulation(shipped_simulation("clean")), bus),
-    ):
+    with _simulated(cell), open_bus(bus_address(cell)) as foreign:
         beats = foreign.send_periodic(beat, 0.05)
         code = run_verb("scan", checkout / "configs/cells/demo.yaml", "--json")
         beats.stop()
     assert code == ExitCode.OK
     rows = json.loads(capsys.readouterr().out)["nodes"]
-    assert rows[-1]["node_id"] == 77
-    assert rows[-1]["remarks"] == [NO_ANSWER]
+    last = rows[-1]
+    assert last["node_id"] == 77
+    assert last["remarks"] == [NO_ANSWER]
 
 
 def test_two_devices_and_a_profile_that_does_not_fit_are_said(cell: Cell) -> None:
     shared = replace(_node(1, 0x250), shared="two answers to one request")
-    rows = scanned_nodes(
-        cell, (shared, _node(2, 0x250)), "demo", {"J2": "found no object 6074h:00"}
-    )
+    other = _node(2, 0x250)
+    missing_objects = {"J2": "found no object 6074h:00"}
+    rows = scanned_nodes(cell, (shared, other), "demo", missing_objects)
     verdicts = [row.verdict for row in rows[:2]]
     assert verdicts == ["two devices", "profile does not fit"]
     report = scan_report(cell, rows, {}, (), ())
@@ -305,10 +338,7 @@ def test_two_devices_and_a_profile_that_does_not_fit_are_said(cell: Cell) -> Non
 def test_a_drive_without_an_object_of_its_profile_is_found_on_the_bus(
     checkout: Path, cell: Cell, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with (
-        open_bus(bus_address(cell)) as bus,
-        SimulatedCell(load_simulation(shipped_simulation("clean")), bus) as simulated,
-    ):
+    with _simulated(cell) as simulated:
         server = simulated.nodes[2]._sdo
         sound = server._read
 
@@ -318,7 +348,8 @@ def test_a_drive_without_an_object_of_its_profile_is_found_on_the_bus(
             return sound(index, subindex)
 
         monkeypatch.setattr(server, "_read", read)
-        assert run_verb("scan", checkout / "configs/cells/demo.yaml", "--json") == ExitCode.OK
+        code = run_verb("scan", checkout / "configs/cells/demo.yaml", "--json")
+    assert code == ExitCode.OK
     printed = capsys.readouterr().out
     rows = json.loads(printed)["nodes"]
     expected = ["ok", "ok", "profile does not fit", "ok", "ok", "ok"]
@@ -335,14 +366,10 @@ def test_a_drive_with_a_vendor_alone_passes_a_cell_without_its_product_and_seria
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    configs = Path(shutil.copytree(checkout / "configs", tmp_path / "configs"))
-    file = configs / "cells/demo.yaml"
+    file = _copied_cell_file(checkout, tmp_path)
     declared = file.read_text()
     vendor_alone = declared.replace(", product_code: 0x00040200, serial: 1005", "")
-    with (
-        open_bus(bus_address(cell)) as bus,
-        SimulatedCell(load_simulation(shipped_simulation("clean")), bus) as simulated,
-    ):
+    with _simulated(cell) as simulated:
         server = simulated.nodes[4]._sdo
         complete = server._read
 
@@ -366,7 +393,7 @@ def test_a_drive_with_a_vendor_alone_passes_a_cell_without_its_product_and_seria
 
 
 def test_a_fault_is_named_beside_what_else_is_wrong(cell: Cell) -> None:
-    (row, *_) = scanned_nodes(cell, (_node(1, 0x208, serial=9),), "demo")
+    row = _first_row(cell, _node(1, 0x208, serial=9))
     assert row.verdict == "other serial number, in fault"
 
 
@@ -374,8 +401,7 @@ def test_a_fault_is_reset_when_a_person_says_so_and_nothing_gets_power(
     checkout: Path, cell: Cell, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = str(checkout / "configs/cells/demo.yaml")
-    spec = load_simulation(shipped_simulation("clean"))
-    with open_bus(bus_address(cell)) as bus, SimulatedCell(spec, bus) as simulated:
+    with _simulated(cell) as simulated:
         simulated.nodes[2].drive.fail(ErrorCode.FOLLOWING_ERROR)
         assert run_verb("scan", file) == ExitCode.OK
         shown = capsys.readouterr().out
@@ -406,28 +432,28 @@ def test_a_mistyped_nameplate_is_reported_with_its_line(
     The data of J1's motor are for amperes of the other amplitude, which is within the limit, and a
     warning.
     """
-    configs = Path(shutil.copytree(checkout / "configs", tmp_path / "configs"))
-    file = configs / "cells/demo.yaml"
+    file = _copied_cell_file(checkout, tmp_path)
     changed_text = file.read_text().replace("25.65", "25650")
     file.write_text(changed_text)
-    lines = file.read_text().splitlines()
-    line = 1 + next(n for n, text in enumerate(lines) if "25650" in text)
-    spec = load_simulation(shipped_simulation("clean"))
-    nameplate_gain = cell.axes[0].nameplate_gain
-    gains = np.array([np.sqrt(2.0) * nameplate_gain, 0.0, 25.65])
-    reduction = DriveTrain(cell.ratio).reduction
-    absolute_reduction = np.abs(reduction[:3])
-    constants = gains / absolute_reduction
-    first, third = (
-        replace(spec.axes[i], entered_torque_nm=constants[i] * spec.axes[i].rated_current_a)
-        for i in (0, 2)
-    )
-    axes = (first, spec.axes[1], third, *spec.axes[3:])
-    spec = replace(spec, axes=axes)
+    before_number = changed_text.partition("25650")[0]
+    line = 1 + before_number.count("\n")
+
+    spec = _clean_simulation()
+    reduction = np.abs(DriveTrain(cell.ratio).reduction)
+    other_amplitude = np.sqrt(2.0) * cell.axes[0].nameplate_gain
+    gain_of_axis = {0: other_amplitude, 2: 25.65}
+    axes = list(spec.axes)
+    for axis, gain in gain_of_axis.items():
+        motor_constant = gain / reduction[axis]
+        torque_nm = motor_constant * axes[axis].rated_current_a
+        axes[axis] = replace(axes[axis], entered_torque_nm=torque_nm)
+    spec = replace(spec, axes=tuple(axes))
+
     with open_bus(bus_address(cell)) as bus, SimulatedCell(spec, bus):
         assert run_verb("scan", file) == ExitCode.OK
         shown = capsys.readouterr()
-        (configs / "controllers/demo.yaml").unlink()
+        controller = tmp_path / "configs/controllers/demo.yaml"
+        controller.unlink()
         assert run_verb("scan", file, "--json") == ExitCode.OK
         document = json.loads(capsys.readouterr().out)
     assert (
@@ -437,9 +463,11 @@ def test_a_mistyped_nameplate_is_reported_with_its_line(
     assert "Next" not in shown.err
     (by_drive,) = document["mistyped"]
     assert "while N·Kt of the drive's motor is 25.65 (" in by_drive
-    (warning,) = (text for text in document["warnings"] if text.startswith("J1: "))
+    warnings = document["warnings"]
+    (warning,) = [text for text in warnings if text.startswith("J1: ")]
     assert "near √2" in warning
-    assert warning.split()[-1] in shown.out
+    last_word = warning.split()[-1]
+    assert last_word in shown.out
 
 
 # -- a cell file that every other verb refuses
@@ -456,16 +484,12 @@ def scan_edited(
     """JSON and text of a scan of the demo cell with an edited file,
     all of whose drives are on the bus.
     """
-    configs = Path(shutil.copytree(checkout / "configs", folder / "configs"))
-    file = configs / "cells/demo.yaml"
+    file = _copied_cell_file(checkout, folder)
     before = file.read_text(encoding="utf-8")
     edited = edit(before)
     assert edited != before
     file.write_text(edited, encoding="utf-8")
-    with (
-        open_bus(bus_address(cell)) as bus,
-        SimulatedCell(load_simulation(shipped_simulation("clean")), bus),
-    ):
+    with _simulated(cell):
         assert run_verb("scan", file, "--json") == ExitCode.OK
         document = json.loads(capsys.readouterr().out)
         assert run_verb("scan", file) == ExitCode.OK
@@ -515,9 +539,10 @@ def test_a_wrong_number_elsewhere_keeps_no_drive_from_being_found(
     said: str,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    document, shown = scan_edited(
-        checkout, cell, tmp_path, lambda text: text.replace(before, after, 1), capsys
-    )
+    def edit(text: str) -> str:
+        return text.replace(before, after, 1)
+
+    document, shown = scan_edited(checkout, cell, tmp_path, edit, capsys)
     verdicts = [row["verdict"] for row in document["nodes"]]
     assert verdicts == ["ok"] * 6
     assert said in document["cell_fault"]
@@ -560,8 +585,7 @@ def test_what_is_wrong_with_one_axis_costs_that_axis_alone(
 def test_a_file_without_any_node_id_is_refused_as_before(
     checkout: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    configs = Path(shutil.copytree(checkout / "configs", tmp_path / "configs"))
-    file = configs / "cells/demo.yaml"
+    file = _copied_cell_file(checkout, tmp_path)
     changed_text = file.read_text().replace("node_id: ", "node: ")
     file.write_text(changed_text)
     assert run_verb("scan", file, "--json") == ExitCode.CONFIGURATION
@@ -588,14 +612,10 @@ def test_a_scan_while_a_recorder_has_the_bus_is_refused_like_a_second_recording(
     checkout: Path, cell: Cell, options: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = str(checkout / "configs/cells/demo.yaml")
-    spec = load_simulation(shipped_simulation("clean"))
-    with (
-        open_bus(bus_address(cell)) as bus,
-        SimulatedCell(spec, bus),
-        open_bus(bus_address(cell)) as witness,
-    ):
+    with _simulated(cell), open_bus(bus_address(cell)) as witness:
         with bus_lock(cell):
-            assert run_verb("scan", file, "--json", *options) == ExitCode.BUS_TAKEN
+            code = run_verb("scan", file, "--json", *options)
+        assert code == ExitCode.BUS_TAKEN
         failure = json.loads(capsys.readouterr().err)
         assert failure["kind"] == "BusTaken"
         assert failure["exit_code"] == ExitCode.BUS_TAKEN
@@ -609,12 +629,7 @@ def test_a_scan_beside_a_master_whose_lock_is_not_seen_sends_nothing(
 ) -> None:
     """A recorder in a container, on another computer, or of another maker."""
     over = threading.Event()
-    spec = load_simulation(shipped_simulation("clean"))
-    with (
-        open_bus(bus_address(cell)) as bus,
-        SimulatedCell(spec, bus),
-        open_bus(bus_address(cell)) as master,
-    ):
+    with _simulated(cell), open_bus(bus_address(cell)) as master:
 
         def lead() -> None:
             while not over.wait(0.01):
@@ -655,33 +670,29 @@ def test_a_scan_in_the_middle_of_a_motion_leaves_it_alone_and_accuses_no_drive(
     plan = tmp_path / "plan.yaml"
     log = tmp_path / "a.mcap"
     plan.write_text(PLAN, encoding="utf-8")
-    command = [
-        "record",
-        str(file),
-        str(plan),
-        "--out",
-        str(log),
-        "--enable-motion",
-        "--speed",
-        "0.05",
-    ]
+    files = [str(file), str(plan), "--out", str(log)]
+    command = ["record", *files, "--enable-motion", "--speed", "0.05"]
     ended: list[int] = []
-    recorder = threading.Thread(target=lambda: ended.append(main(command)))
-    spec = load_simulation(shipped_simulation("clean"))
 
-    with open_bus(bus_address(cell)) as bus, SimulatedCell(spec, bus) as simulated:
+    def record() -> None:
+        code = main(command)
+        ended.append(code)
+
+    recorder = threading.Thread(target=record)
+
+    with _simulated(cell) as simulated:
 
         def in_motion(link: Link) -> bool:
             """Whether all axes have power, and all heartbeats that the link knows came since
             then.
             """
-            if not all(
-                node.drive.state is PowerState.OPERATION_ENABLED for node in simulated.nodes
-            ):
+            states = {node.drive.state for node in simulated.nodes}
+            if states != {PowerState.OPERATION_ENABLED}:
                 for node in simulated.nodes:
                     link.count_beats(node.node_id)
                 return False
-            known = [len(link._beats.get(node.node_id, ())) for node in simulated.nodes]
+            beats = [link._beats.get(node.node_id, ()) for node in simulated.nodes]
+            known = [len(of_node) for of_node in beats]
             return min(known) == BEATS_KEPT
 
         recorder.start()
@@ -689,7 +700,8 @@ def test_a_scan_in_the_middle_of_a_motion_leaves_it_alone_and_accuses_no_drive(
         code = main(["scan", str(file)])
         recorder.join()
     assert code == ExitCode.BUS_TAKEN
-    assert [link.shared_id(node_id, 100) for node_id in range(1, 7)] == [""] * 6
+    shared = [link.shared_id(node_id, 100) for node_id in range(1, 7)]
+    assert shared == [""] * 6
     # All moves were made; on a busy machine an answer of the simulated cell may be late, which is
     # counted.
     assert ended[0] in (ExitCode.OK, ExitCode.DATA_UNFIT)
@@ -710,16 +722,18 @@ def two(checkout: Path) -> Cell:
 
 
 def test_a_node_is_reported_where_it_is_and_where_it_belongs(two: Cell) -> None:
-    left = scanned_nodes(two, tuple(_node(number, 0x250) for number in (1, 2, 4, 9)), "left")
-    expected = [
-        ("left", 1, "J1", "ok"),
-        ("left", 2, "J2", "ok"),
-        ("left", 3, "J3", "missing"),
-        ("left", 4, "J4", "belongs on right"),
-        ("left", 9, None, "not configured"),
+    left = scanned_nodes(two, _nodes((1, 2, 4, 9), 0x250), "left")
+    buses = [row.bus for row in left]
+    assert buses == ["left"] * 5
+    of_nodes = [(row.node_id, row.axis, row.verdict) for row in left]
+    assert of_nodes == [
+        (1, "J1", "ok"),
+        (2, "J2", "ok"),
+        (3, "J3", "missing"),
+        (4, "J4", "belongs on right"),
+        (9, None, "not configured"),
     ]
-    assert [(row.bus, row.node_id, row.axis, row.verdict) for row in left] == expected
-    right = scanned_nodes(two, tuple(_node(number, 0x250) for number in (4, 5, 6)), "right")
+    right = scanned_nodes(two, _nodes((4, 5, 6), 0x250), "right")
     verdicts = [row.verdict for row in right]
     assert verdicts == ["ok"] * 3
     out = io.StringIO()
@@ -727,6 +741,8 @@ def test_a_node_is_reported_where_it_is_and_where_it_belongs(two: Cell) -> None:
     nodes = left + right
     console.print(scan_table(nodes))
     heading, _, *lines = out.getvalue().splitlines()
-    assert heading.split()[:2] == ["bus", "node"]
-    assert [line.split()[0] for line in lines if line.strip()] == ["left"] * 5 + ["right"] * 3
+    first_headings = heading.split()[:2]
+    assert first_headings == ["bus", "node"]
+    first_words = [line.split()[0] for line in lines if line.strip()]
+    assert first_words == ["left"] * 5 + ["right"] * 3
     assert "belongs on right" in out.getvalue()

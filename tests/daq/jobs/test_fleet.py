@@ -16,7 +16,7 @@ import socket
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -73,10 +73,9 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("fleet")
     (plans,) = plans_of(1, exchanges=40, duration_s=5.5)
     for number in range(CELLS):
-        made = FleetCell(
-            folder, number, plans, runs=3 if number < WITH_HOLDOUT else 2, period_us=4000
-        )
-        make_cell(made)
+        runs = 3 if number < WITH_HOLDOUT else 2
+        cell = FleetCell(folder, number, plans, runs=runs, period_us=4000)
+        make_cell(cell)
     return folder
 
 
@@ -85,7 +84,8 @@ def single(fleet: Path) -> dict[str, dict[str, Any]]:
     """Results of single fits, by cell."""
     made = {}
     for folder in sorted(fleet.iterdir()):
-        holdout = [log for log in (folder / "held-out.mcap",) if log.exists()]
+        held_out = folder / "held-out.mcap"
+        holdout = [held_out] if held_out.exists() else []
         logs = [folder / "bare.mcap", folder / "loaded.mcap"]
         fitted = fit(logs, holdout=holdout)
         document = as_document(calibration_of(fitted, CREATED))
@@ -97,26 +97,48 @@ def single(fleet: Path) -> dict[str, dict[str, Any]]:
 def few(fleet: Path, tmp_path: Path) -> Path:
     """A folder of its own with the logs of three of the cells."""
     folder = tmp_path / "logs"
-    for number in (0, 2, 3):
-        shutil.copytree(fleet / f"cell-{number:03d}", folder / f"cell-{number:03d}")
+    for cell in ("cell-000", "cell-002", "cell-003"):
+        shutil.copytree(fleet / cell, folder / cell)
     return folder
 
 
 def _timeless(document: dict[str, object]) -> dict[str, Any]:
-    return {key: value for key, value in document.items() if key != "created"}
+    timeless = dict(document)
+    del timeless["created"]
+    return timeless
 
 
 def _files(out: Path) -> dict[str, dict[str, Any]]:
     """Calibrations in a folder, by cell."""
-    sorted_files = sorted(out.glob("*.yaml"))
-    made = [load_calibration(file) for file in sorted_files]
-    return {calibration.cell: _timeless(as_document(calibration)) for calibration in made}
+    documents = {}
+    for file in sorted(out.glob("*.yaml")):
+        calibration = load_calibration(file)
+        document = as_document(calibration)
+        documents[calibration.cell] = _timeless(document)
+    return documents
+
+
+def _fleet(logs: str | Path, *arguments: str | Path) -> int:
+    """Run `drivegain fleet` on the logs; its exit code."""
+    texts = [str(argument) for argument in arguments]
+    return main(["fleet", str(logs), *texts])
+
+
+def _by_cell(logs: str | Path) -> tuple[CellLogs, ...]:
+    """The logs of each cell in a place."""
+    found = survey(list_logs(str(logs)))
+    return by_cell(log for log in found if isinstance(log, SeenLog))
+
+
+def _are_cached(rows: Iterable[FleetRow]) -> list[bool]:
+    return [row.kept for row in rows]
 
 
 def _fitted(logs: Path, out: Path | None, loop: Loop = Loop.OPEN) -> tuple[FleetRow, ...]:
     with worker_pool("threads", 2) as pool:
-        shelf = None if out is None else open_cache(out, loop)
-        return fit_fleet(list_logs(str(logs)), pool, loop, shelf, lambda: CREATED)
+        cache = None if out is None else open_cache(out, loop)
+        found = list_logs(str(logs))
+        return fit_fleet(found, pool, loop, cache, lambda: CREATED)
 
 
 def _reported(rows: tuple[FleetRow, ...]) -> list[FleetRow]:
@@ -135,25 +157,31 @@ def test_threads_give_each_cell_what_a_single_fit_gives(
     monkeypatch.setattr(fleet_module, "SURVEYED", 4)
     out = tmp_path / "out"
     table = tmp_path / "fleet.csv"
-    code = main(
-        ["fleet", str(fleet), "--workers", "2", "--out", str(out), "--csv", str(table), "--json"]
-    )
+
+    code = _fleet(fleet, "--workers", "2", "--out", out, "--csv", table, "--json")
+
     assert code == ExitCode.OK
     document = json.loads(capsys.readouterr().out)
-    assert (document["fitted"], document["failed"]) == (CELLS, 0)
+    assert document["fitted"] == CELLS
+    assert document["failed"] == 0
     assert _files(out) == single
-    expected = ["holdout"] * WITH_HOLDOUT + ["fit"] * (CELLS - WITH_HOLDOUT)
-    assert [cell["error_on"] for cell in document["cells"]] == expected
+
+    cells = document["cells"]
+    errors_on = [cell["error_on"] for cell in cells]
+    without_holdout = CELLS - WITH_HOLDOUT
+    assert errors_on == ["holdout"] * WITH_HOLDOUT + ["fit"] * without_holdout
+
     string_io = io.StringIO(table.read_text())
     rows = list(csv.DictReader(string_io))
-    for row, cell in zip(rows, document["cells"], strict=True):
-        assert row["cell"] == cell["cell"]
-        gains = single[row["cell"]]["gains"]
-        assert [float(row[f"{gain['axis']} gain"]) for gain in cell["gains"]] == [
-            gain["value"] for gain in gains
-        ]
+    for row, cell in zip(rows, cells, strict=True):
+        name = row["cell"]
+        assert name == cell["cell"]
+        columns = [f"{gain['axis']} gain" for gain in cell["gains"]]
+        printed = [float(row[column]) for column in columns]
+        single_gains = [gain["value"] for gain in single[name]["gains"]]
+        assert printed == single_gains
         path = Path(row["calibration"])
-        assert load_calibration(path).cell == row["cell"]
+        assert load_calibration(path).cell == name
 
 
 @pytest.mark.processes
@@ -161,8 +189,8 @@ def test_processes_give_the_same(
     fleet: Path, single: dict[str, dict[str, Any]], tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
-    command = ["fleet", str(fleet), "--scheduler", "processes", "--workers", "2", "--out", str(out)]
-    assert main(command) == ExitCode.OK
+    code = _fleet(fleet, "--scheduler", "processes", "--workers", "2", "--out", out)
+    assert code == ExitCode.OK
     assert _files(out) == single
 
 
@@ -179,10 +207,9 @@ def test_a_scheduler_that_runs_already_gives_the_same(
         protocol="tcp",
         dashboard_address=None,
     ) as cluster:
-        assert (
-            main(["fleet", str(few), "--scheduler", cluster.scheduler_address, "--out", str(out)])
-            == ExitCode.OK
-        )
+        address = cluster.scheduler_address
+        code = _fleet(few, "--scheduler", address, "--out", out)
+        assert code == ExitCode.OK
         assert len(cluster.scheduler.workers) == 1  # it goes on
     made = _files(out)
     expected = {cell: single[cell] for cell in made}
@@ -194,12 +221,14 @@ def test_the_table_shows_every_cell_and_marks_errors_on_the_fit_itself(
     few: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("COLUMNS", "100")
-    assert main(["fleet", str(few)]) == ExitCode.OK
+    assert _fleet(few) == ExitCode.OK
     shown = capsys.readouterr().out
     assert "3 of 3 fitted." in shown
-    lines = {line.split()[0]: line for line in shown.splitlines() if line.startswith("cell-")}
-    assert set(lines) == {"cell-000", "cell-002", "cell-003"}
-    assert [name for name, line in lines.items() if "*" in line] == ["cell-002", "cell-003"]
+    lines = [line for line in shown.splitlines() if line.startswith("cell-")]
+    cells = [line.split()[0] for line in lines]
+    assert cells == ["cell-000", "cell-002", "cell-003"]
+    marked = [line.split()[0] for line in lines if "*" in line]
+    assert marked == ["cell-002", "cell-003"]
     assert "* on the moves of the fit" in shown
 
 
@@ -208,15 +237,23 @@ def test_a_cell_that_cannot_be_fitted_is_a_row_and_not_the_end(
 ) -> None:
     (few / "cell-000" / "loaded.mcap").unlink()
     (few / "cell-000" / "held-out.mcap").unlink()
-    bare_path = few / "cell-002" / "bare.mcap"
-    whole = bare_path.read_bytes()
-    (few / "cell-002" / "bare.mcap").write_bytes(whole[: len(whole) // 2])
+    bare = few / "cell-002" / "bare.mcap"
+    complete = bare.read_bytes()
+    half = len(complete) // 2
+    bare.write_bytes(complete[:half])
     (few / "ownerless.mcap").write_bytes(b"\x89MCAP0\r\nno log of ours")
-    path = few / "foreign.mcap"
-    write(path, content(2), samples([(1, 2)] * 5))
-    assert main(["fleet", str(few), "--json"]) == ExitCode.DATA_UNFIT
-    document = json.loads(capsys.readouterr().out)
-    errors = {cell["cell"]: cell["error"] and cell["error"]["kind"] for cell in document["cells"]}
+    foreign = few / "foreign.mcap"
+    write(foreign, content(2), samples([(1, 2)] * 5))
+
+    code = _fleet(few, "--json")
+
+    assert code == ExitCode.DATA_UNFIT
+    cells = json.loads(capsys.readouterr().out)["cells"]
+    errors = {}
+    for cell in cells:
+        name = cell["cell"]
+        error = cell["error"]
+        errors[name] = error and error["kind"]
     expected = {
         "cell-000": "PayloadMissing",
         "cell-002": "LogTruncated",
@@ -225,11 +262,11 @@ def test_a_cell_that_cannot_be_fitted_is_a_row_and_not_the_end(
         "ownerless.mcap": "LogTruncated",
     }
     assert errors == expected
-    exit_codes = [cell["exit_code"] for cell in document["cells"]]
+    exit_codes = [cell["exit_code"] for cell in cells]
     assert exit_codes == [4, 4, 0, 6, 4]
-    (truncated,) = (cell for cell in document["cells"] if cell["cell"] == "cell-002")
+    (truncated,) = [cell for cell in cells if cell["cell"] == "cell-002"]
     text = truncated["error"]["text"]
-    assert str(few / "cell-002" / "bare.mcap") in text
+    assert str(bare) in text
 
 
 def test_a_run_that_its_recorder_marked_invalid_is_reported_its_cell(
@@ -237,16 +274,13 @@ def test_a_run_that_its_recorder_marked_invalid_is_reported_its_cell(
 ) -> None:
     files = bundle(checkout / "configs/cells/demo.yaml")
     path = tmp_path / "a.mcap"
-    write(
-        path,
-        content(6, None, files),
-        samples([(0,) * 6] * 9),
-        verdict=(False, "the drives fell off"),
-    )
+    zeros = samples([(0,) * 6] * 9)
+    write(path, content(6, None, files), zeros, verdict=(False, "the drives fell off"))
     (row,) = _fitted(tmp_path, None)
     assert row.cell == "demo"
     assert isinstance(row.result, Failure)
-    assert (row.result.kind, row.result.exit_code) == ("RunInvalid", ExitCode.DATA_UNFIT)
+    assert row.result.kind == "RunInvalid"
+    assert row.result.exit_code == ExitCode.DATA_UNFIT
     assert "the drives fell off" in row.result.text
 
 
@@ -254,49 +288,69 @@ def test_two_configurations_of_a_cell_are_two_rows_and_said_so(
     tmp_path: Path, checkout: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     files = bundle(checkout / "configs/cells/demo.yaml")
-    other = files | {"cell.yaml": files["cell.yaml"] + b"\n# moved to another hall\n"}
-    for name, carried in (("a", files), ("b", other), ("c", files)):
+    cell_file = files["cell.yaml"] + b"\n# moved to another hall\n"
+    other = files | {"cell.yaml": cell_file}
+    files_of_log = {"a": files, "b": other, "c": files}
+    zeros = [(0,) * 6] * 9
+    for name, carried in files_of_log.items():
         path = tmp_path / f"{name}.mcap"
-        write(path, content(6, None, carried), samples([(0,) * 6] * 9))
-    assert main(["fleet", str(tmp_path), "--json"]) == ExitCode.DATA_UNFIT
+        write(path, content(6, None, carried), samples(zeros))
+
+    assert _fleet(tmp_path, "--json") == ExitCode.DATA_UNFIT
     printed = capsys.readouterr().out
     document = json.loads(printed)["cells"]
-    expected = [("demo", 2), ("demo", 2)]
-    assert [(cell["cell"], cell["configurations"]) for cell in document] == expected
-    sorted_fit_counts = sorted(len(cell["fit"]) for cell in document)
-    assert sorted_fit_counts == [1, 2]
-    assert main(["fleet", str(tmp_path)]) == ExitCode.DATA_UNFIT
-    assert "demo: logs of 2 configurations" in " ".join(capsys.readouterr().out.split())
+    cells = [cell["cell"] for cell in document]
+    assert cells == ["demo", "demo"]
+    configurations = [cell["configurations"] for cell in document]
+    assert configurations == [2, 2]
+    fit_counts = [len(cell["fit"]) for cell in document]
+    assert sorted(fit_counts) == [1, 2]
+
+    assert _fleet(tmp_path) == ExitCode.DATA_UNFIT
+    printed = capsys.readouterr().out
+    words = " ".join(printed.split())
+    assert "demo: logs of 2 configurations" in words
 
 
 def test_a_second_run_does_only_what_is_new(few: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     first = _fitted(few, out)
-    expected = [False] * 3
-    assert [row.kept for row in first] == expected
+    assert _are_cached(first) == [False, False, False]
     second = _fitted(few, out)
-    assert [row.kept for row in second] == [True] * 3
+    assert _are_cached(second) == [True, True, True]
     changed_rows = tuple(replace(row, kept=True) for row in first)
     assert second == changed_rows
-    # Another log, another content, a damaged calibration, a state that is none.
+
+    # Another log
     (few / "cell-000" / "held-out.mcap").unlink()
-    assert [row.kept for row in _fitted(few, out)] == [False, True, True]
+    rows = _fitted(few, out)
+    assert _are_cached(rows) == [False, True, True]
+
+    # Another content
     bare = few / "cell-002" / "bare.mcap"
     bare.write_bytes(bare.read_bytes()[:-1])
     third = _fitted(few, out)
-    assert [row.kept for row in third] == [True, False, True]
+    assert _are_cached(third) == [True, False, True]
     assert not third[1].fitted
-    assert third[2].file is not None
-    changed_content = third[2].file.read_bytes().replace(b"cell-003", b"cell-004")
-    third[2].file.write_bytes(changed_content)
-    assert [row.kept for row in _fitted(few, out)] == [True, False, False]
+
+    # A damaged calibration
     file = third[2].file
+    assert file is not None
+    changed_content = file.read_bytes().replace(b"cell-003", b"cell-004")
+    file.write_bytes(changed_content)
+    rows = _fitted(few, out)
+    assert _are_cached(rows) == [True, False, False]
+
+    # A state that is none
     file.with_suffix(".json").write_text("[]")
-    assert [row.kept for row in _fitted(few, out)] == [True, False, False]
+    rows = _fitted(few, out)
+    assert _are_cached(rows) == [True, False, False]
+
     for cell in ("cell-000", "cell-002"):
         shutil.rmtree(few / cell)
     rows = _fitted(few, None)
-    assert _reported(rows) == [replace(_reported(third)[2], file=None)]
+    third_row = _reported(third)[2]
+    assert _reported(rows) == [replace(third_row, file=None)]
 
 
 def _only(few: Path, cell: str) -> CellLogs:
@@ -304,8 +358,13 @@ def _only(few: Path, cell: str) -> CellLogs:
     for folder in few.iterdir():
         if folder.name != cell:
             shutil.rmtree(folder)
-    (logs,) = by_cell(log for log in survey(list_logs(str(few))) if isinstance(log, SeenLog))
+    (logs,) = _by_cell(few)
     return logs
+
+
+def _cache_file(out: Path, cell: CellLogs, ending: str) -> Path:
+    cache = open_cache(out, Loop.OPEN)
+    return cache.file(cell).with_suffix(ending)
 
 
 @pytest.mark.parametrize("ending", [".yaml", ".json"])
@@ -315,7 +374,7 @@ def test_a_file_on_the_shelf_that_is_too_large_is_replaced(
     cell = _only(few, "cell-003")
     out = tmp_path / "out"
     (first,) = _fitted(few, out)
-    file = open_cache(out, Loop.OPEN).file(cell).with_suffix(ending)
+    file = _cache_file(out, cell, ending)
     file.unlink()
     with file.open("wb") as stream:
         stream.truncate(2**40)
@@ -336,22 +395,27 @@ def test_what_cannot_be_replaced_on_the_shelf_is_reported_before_anything_is_fit
     cell = _only(few, "cell-003")
     out = tmp_path / "out"
     monkeypatch.setattr(fleet_module, "fit_cell", None)
-    file = open_cache(out, Loop.OPEN).file(cell).with_suffix(ending)
-    if what == "folder":
-        file.mkdir()
-    elif what == "pipe":
-        os.mkfifo(file)
+    file = _cache_file(out, cell, ending)
+    target = tmp_path / "there" if what.startswith("link") else file
+    if what.endswith("folder"):
+        target.mkdir()
+        found = "a folder"
     else:
-        target = tmp_path / "there"
-        target.mkdir() if what == "link to a folder" else os.mkfifo(target)
+        os.mkfifo(target)
+        found = "no regular file"
+    if target != file:
         file.symlink_to(target)
     before = file.lstat().st_ino
-    with pytest.raises(UsageError, match=re.escape(str(file))) as caught:
+
+    name = re.escape(str(file))
+    with pytest.raises(UsageError, match=name) as caught:
         _fitted(few, out)
-    assert ("a folder" if "folder" in what else "no regular file") in str(caught.value)
-    assert "move it away" in str(caught.value)
+
+    message = str(caught.value)
+    assert found in message
+    assert "move it away" in message
     assert file.lstat().st_ino == before
-    assert main(["fleet", str(few), "--out", str(out)]) == ExitCode.USAGE
+    assert _fleet(few, "--out", out) == ExitCode.USAGE
 
 
 def test_a_folder_that_comes_in_the_place_of_a_note_meanwhile_is_reported_by_its_name(
@@ -359,23 +423,27 @@ def test_a_folder_that_comes_in_the_place_of_a_note_meanwhile_is_reported_by_its
 ) -> None:
     cell = _only(few, "cell-003")
     folder = tmp_path / "out"
-    shelf = open_cache(folder, Loop.OPEN)
+    cache = open_cache(folder, Loop.OPEN)
     made = fit_cell(cell, Loop.OPEN, CREATED)
-    note = shelf.file(cell).with_suffix(".json")
+    note = cache.file(cell).with_suffix(".json")
     note.mkdir()
     assert isinstance(made, FleetFit)
-    with pytest.raises(OutputFailed, match=re.escape(str(note))):
-        shelf.store(cell, made)
+    name = re.escape(str(note))
+    with pytest.raises(OutputFailed, match=name):
+        cache.store(cell, made)
 
 
 def test_other_options_are_another_fit(few: Path, tmp_path: Path) -> None:
     for cell in ("cell-000", "cell-003"):
         shutil.rmtree(few / cell)
-    logs = by_cell(log for log in survey(list_logs(str(few))) if isinstance(log, SeenLog))
-    _fitted(few, tmp_path / "out")
-    opened, closed = (open_cache(tmp_path / "out", loop) for loop in (Loop.OPEN, Loop.CLOSED))
-    assert all(opened.cached(cell) is not None for cell in logs)
-    assert all(closed.cached(cell) is None for cell in logs)
+    logs = _by_cell(few)
+    out = tmp_path / "out"
+    _fitted(few, out)
+    opened = open_cache(out, Loop.OPEN)
+    closed = open_cache(out, Loop.CLOSED)
+    for cell_logs in logs:
+        assert opened.cached(cell_logs) is not None
+        assert closed.cached(cell_logs) is None
 
 
 KILLED = """
@@ -402,14 +470,12 @@ def test_killed_in_the_middle_and_started_again_it_gives_the_same(
 ) -> None:
     out = tmp_path / "out"
     env = os.environ | {"OMP_NUM_THREADS": "1"}
-    done = subprocess.run(
-        [sys.executable, "-c", KILLED, str(fleet), str(out), "2"],
-        check=False,
-        env=env,
-    )
+    command = [sys.executable, "-c", KILLED, str(fleet), str(out), "2"]
+    done = subprocess.run(command, check=False, env=env)
     assert done.returncode == -signal.SIGKILL
     again = _fitted(fleet, out)
-    assert 2 <= sum(row.kept for row in again) < CELLS
+    cached_count = sum(_are_cached(again))
+    assert 2 <= cached_count < CELLS
     cells = [row.cell for row in again]
     assert cells == sorted(single)
     assert _files(out) == single
@@ -426,25 +492,28 @@ def test_an_object_store_is_read_in_the_workers_and_leaves_nothing_behind(
     monkeypatch.setattr(tempfile, "tempdir", str(scratch))
     store: Any = import_module("fsspec").filesystem("memory")
     for log in few.rglob("*.mcap"):
-        store.pipe(f"/hall/{log.relative_to(few)}", log.read_bytes())
+        name = log.relative_to(few)
+        store.pipe(f"/hall/{name}", log.read_bytes())
     try:
         out = tmp_path / "out"
-        assert main(["fleet", "memory://hall", "--out", str(out)]) == ExitCode.OK
+        assert _fleet("memory://hall", "--out", out) == ExitCode.OK
         made = _files(out)
         expected = {cell: single[cell] for cell in made}
         assert made == expected
         assert len(made) == 3
         assert list(scratch.iterdir()) == []
-        seen = by_cell(
-            log for log in survey(list_logs("memory://hall")) if isinstance(log, SeenLog)
-        )
-        assert all(open_cache(out, Loop.OPEN).cached(cell) is not None for cell in seen)
+        for cell in _by_cell("memory://hall"):
+            cache = open_cache(out, Loop.OPEN)
+            assert cache.cached(cell) is not None
+
         # A fault of a copy is reported under the name of its original.
-        whole = store.cat_file("/hall/cell-002/bare.mcap")
-        store.pipe("/hall/cell-002/bare.mcap", whole[:-100])
+        complete = store.cat_file("/hall/cell-002/bare.mcap")
+        store.pipe("/hall/cell-002/bare.mcap", complete[:-100])
         with worker_pool("threads", 1) as pool:
-            rows = fit_fleet(list_logs("memory://hall"), pool, Loop.OPEN, None, lambda: CREATED)
-        (failed,) = (row.result for row in rows if isinstance(row.result, Failure))
+            logs = list_logs("memory://hall")
+            rows = fit_fleet(logs, pool, Loop.OPEN, None, lambda: CREATED)
+        results = [row.result for row in rows]
+        (failed,) = [result for result in results if isinstance(result, Failure)]
         assert failed.text.startswith("memory:///hall/cell-002/bare.mcap")
     finally:
         store.rm("/hall", recursive=True)
@@ -480,26 +549,30 @@ def test_a_name_of_a_log_that_is_no_file_is_a_row(
     os.mkfifo(logs / "pipe.mcap")
     with socket.socket(socket.AF_UNIX) as one:
         one.bind(str(logs / "socket.mcap"))
-        assert main(["fleet", address.format(logs), "--json"]) == ExitCode.DATA_UNFIT
+        code = _fleet(address.format(logs), "--json")
+
+    assert code == ExitCode.DATA_UNFIT
     printed = capsys.readouterr().out
     cells = json.loads(printed)["cells"]
-    output = {cell["cell"]: cell for cell in cells}
-    expected = {
-        "folder.mcap": f"{logs}/folder.mcap: found a folder",
-        "folder.mcap/gone.mcap": f"{logs}/folder.mcap/gone.mcap: found a link to "
-        f"{tmp_path}/unmounted.mcap, which leads nowhere",
-        "link.mcap": f"{logs}/link.mcap: found a folder",
-        "pipe.mcap": f"{logs}/pipe.mcap: found something that is no regular file",
-        "round.mcap": f"{logs}/round.mcap: found a link to {logs}/round.mcap, which leads nowhere",
-        "socket.mcap": f"{logs}/socket.mcap: found something that is no regular file",
-        "zero.mcap": f"{logs}/zero.mcap: found something that is no regular file",
+    found_of = {
+        "folder.mcap": "a folder",
+        "folder.mcap/gone.mcap": f"a link to {tmp_path}/unmounted.mcap, which leads nowhere",
+        "link.mcap": "a folder",
+        "pipe.mcap": "something that is no regular file",
+        "round.mcap": f"a link to {logs}/round.mcap, which leads nowhere",
+        "socket.mcap": "something that is no regular file",
+        "zero.mcap": "something that is no regular file",
     }
-    assert {
-        name: cell["error"]["text"].split("; expected")[0] for name, cell in output.items()
-    } == expected
-    assert {(cell["error"]["kind"], cell["exit_code"]) for cell in output.values()} == {
-        ("LogMissing", 4)
-    }
+    names = {cell["cell"] for cell in cells}
+    assert names == set(found_of)
+    for cell in cells:
+        name = cell["cell"]
+        error = cell["error"]
+        text = error["text"].split("; expected")[0]
+        found = found_of[name]
+        assert text == f"{logs}/{name}: found {found}"
+        assert error["kind"] == "LogMissing"
+        assert cell["exit_code"] == 4
 
 
 def test_a_log_by_a_link_is_that_log(few: Path, tmp_path: Path) -> None:
@@ -507,7 +580,8 @@ def test_a_log_by_a_link_is_that_log(few: Path, tmp_path: Path) -> None:
     links.mkdir()
     for log in (few / "cell-002").iterdir():
         (links / log.name).symlink_to(log)
-    assert [row.fitted for row in _fitted(links, None)] == [True]
+    (row,) = _fitted(links, None)
+    assert row.fitted is True
 
 
 def test_a_pipe_that_takes_the_place_of_a_log_meanwhile_is_not_opened(tmp_path: Path) -> None:
@@ -524,7 +598,7 @@ def test_a_place_without_logs_is_no_empty_table(
     monkeypatch.chdir(tmp_path)
     with pytest.raises(LogMissing):
         list_logs(place)
-    assert main(["fleet", place]) == ExitCode.DATA_UNFIT
+    assert _fleet(place) == ExitCode.DATA_UNFIT
 
 
 def test_what_is_not_installed_is_named_with_the_line_that_installs_it(
@@ -534,14 +608,8 @@ def test_what_is_not_installed_is_named_with_the_line_that_installs_it(
         raise ImportError(name)
 
     monkeypatch.setattr(fleet_module, "import_module", absent)
-    with (
-        pytest.raises(
-            ConfigurationMissing,
-            match=r"pip install "
-            r"'drivegain\[fleet\]'",
-        ),
-        worker_pool("processes", 1),
-    ):
+    command = r"pip install 'drivegain\[fleet\]'"
+    with pytest.raises(ConfigurationMissing, match=command), worker_pool("processes", 1):
         pass
     with pytest.raises(ConfigurationMissing, match="nonsense"):
         list_logs("nonsense://bucket/logs")
@@ -559,7 +627,8 @@ def test_processes_of_this_machine_say_nothing_about_their_end() -> None:
 
 def test_processes_of_this_machine_listen_to_no_one_else() -> None:
     with worker_pool("processes", 1) as pool:
-        assert pool.executor.submit(len, "abc").result() == 3
+        future = pool.executor.submit(len, "abc")
+        assert future.result() == 3
         assert pool.present()
         psutil = import_module("psutil")  # distributed brings it
         here = psutil.Process()
@@ -584,19 +653,29 @@ def test_a_scheduler_that_does_not_answer_is_reported(monkeypatch: pytest.Monkey
 
 
 def test_the_words_of_scheduler(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[tuple[str, str | int, int | None]] = []
-    monkeypatch.setattr(
-        fleet_module, "_processes", lambda workers: asked.append(("processes", workers, None))
-    )
-    monkeypatch.setattr(
-        fleet_module, "_scheduler", lambda *given: asked.append(("scheduler", *given))
-    )
-    with worker_pool("threads", 3) as pool, worker_pool("threads", None) as as_many_as_processors:
-        expected = (3, len(os.sched_getaffinity(0)))
-        assert (pool.workers, as_many_as_processors.workers) == expected
+    started: list[tuple[str | int | None, ...]] = []
+
+    def processes(workers: int | None) -> None:
+        started.append(("processes", workers))
+
+    def scheduler(address: str, workers: int | None) -> None:
+        started.append(("scheduler", address, workers))
+
+    monkeypatch.setattr(fleet_module, "_processes", processes)
+    monkeypatch.setattr(fleet_module, "_scheduler", scheduler)
+
+    with worker_pool("threads", 3) as pool:
+        assert pool.workers == 3
+    with worker_pool("threads", None) as as_many_as_processors:
+        processors = os.sched_getaffinity(0)
+        assert as_many_as_processors.workers == len(processors)
+
     worker_pool("processes", 2)
     worker_pool("tcp://10.0.0.1:8786", None)
-    assert asked == [("processes", 2, None), ("scheduler", "tcp://10.0.0.1:8786", None)]
+    on_processes, on_scheduler = started
+    assert on_processes == ("processes", 2)
+    assert on_scheduler == ("scheduler", "tcp://10.0.0.1:8786", None)
+
     with pytest.raises(UsageError):
         worker_pool("process", None)
 
@@ -604,11 +683,11 @@ def test_the_words_of_scheduler(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_another_file_is_never_replaced_by_a_table(few: Path, tmp_path: Path) -> None:
     notes = tmp_path / "notes.csv"
     notes.write_text("my notes\n")
-    assert main(["fleet", str(few), "--csv", str(notes)]) == ExitCode.USAGE
+    assert _fleet(few, "--csv", notes) == ExitCode.USAGE
     assert notes.read_text() == "my notes\n"
     fleet_path = tmp_path / "absent" / "fleet.csv"
-    assert main(["fleet", str(few), "--csv", str(fleet_path)]) == ExitCode.UNEXPECTED
-    assert main(["fleet", str(few), "--out", str(notes)]) == ExitCode.USAGE
+    assert _fleet(few, "--csv", fleet_path) == ExitCode.UNEXPECTED
+    assert _fleet(few, "--out", notes) == ExitCode.USAGE
 
 
 def test_an_error_that_no_one_expected_is_a_row(few: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -620,7 +699,8 @@ def test_an_error_that_no_one_expected_is_a_row(few: Path, monkeypatch: pytest.M
 
     monkeypatch.setattr(fleet_module, "fit_cell", sometimes)
     rows = _fitted(few, None)
-    assert [row.fitted for row in rows] == [True, False, True]
+    are_fitted = [row.fitted for row in rows]
+    assert are_fitted == [True, False, True]
     expected = Failure("MemoryError", "MemoryError", ExitCode.UNEXPECTED)
     assert rows[1].result == expected
 
@@ -641,47 +721,48 @@ def test_a_name_that_is_no_text_ends_nothing(
     """Bytes that are no UTF-8, in a log of a cell and in one of no cell."""
     shutil.rmtree(few / "cell-000")
     bare_path = few / "cell-002" / "bare.mcap"
-    bare_path.rename(few / "cell-002" / os.fsdecode(b"b\xff.mcap"))
+    no_utf8 = os.fsdecode(b"b\xff.mcap")
+    bare_path.rename(few / "cell-002" / no_utf8)
     (few / os.fsdecode(b"=c\xff\x1b[2J.mcap")).write_bytes(b"\x89MCAP0\r\nno log of ours")
     out = tmp_path / "out"
     table = tmp_path / "fleet.csv"
-    assert main(["fleet", str(few), "--out", str(out), "--csv", str(table)]) == ExitCode.DATA_UNFIT
+    code = _fleet(few, "--out", out, "--csv", table)
+    assert code == ExitCode.DATA_UNFIT
     assert "\x1b[2J" not in capsys.readouterr().out
     string_io = io.StringIO(table.read_text())
     dict_reader = csv.DictReader(string_io)
-    assert [row["cell"] for row in dict_reader] == [
-        "cell-002",
-        "cell-003",
-        "'=c\\udcff\x1b[2J.mcap",
-    ]
-    assert main(["fleet", str(few), "--out", str(out), "--json"]) == ExitCode.DATA_UNFIT
+    names = [row["cell"] for row in dict_reader]
+    assert names == ["cell-002", "cell-003", "'=c\\udcff\x1b[2J.mcap"]
+
+    assert _fleet(few, "--out", out, "--json") == ExitCode.DATA_UNFIT
     printed = capsys.readouterr().out
     cells = json.loads(printed.encode())["cells"]
     exit_codes = [cell["exit_code"] for cell in cells]
     assert exit_codes == [4, 0, 4]
     error = cells[0]["error"]
     assert "rename it" in error["text"]
-    assert "b\\udcff.mcap" in " ".join(cells[0]["fit"])
+    fit_names = " ".join(cells[0]["fit"])
+    assert "b\\udcff.mcap" in fit_names
 
 
 def test_a_log_that_changes_meanwhile_is_reported(few: Path) -> None:
-    logs = list_logs(str(few))
-    cells = by_cell(log for log in survey(logs) if isinstance(log, SeenLog))
+    cells = _by_cell(few)
     bare_path = few / "cell-002" / "bare.mcap"
     shutil.copy(bare_path, few / "cell-003" / "loaded.mcap")
     loaded_path = few / "cell-000" / "loaded.mcap"
     held_out_path = few / "cell-000" / "held-out.mcap"
     shutil.copy(loaded_path, held_out_path)
-    kinds = [fit_cell(cell, Loop.OPEN, CREATED) for cell in cells]
-    assert [made.kind if isinstance(made, Failure) else "" for made in kinds] == [
-        "LogRepeated",
-        "",
-        "LogsDiffer",
-    ]
-    whole = cells[1]
-    fingerprint = "0" * 64
-    changed_fit = replace(whole.fit[0], fingerprint=fingerprint)
-    stale = replace(whole, fit=(changed_fit, *whole.fit[1:]))
+    results = [fit_cell(cell, Loop.OPEN, CREATED) for cell in cells]
+    first, second, third = results
+    assert isinstance(first, Failure)
+    assert first.kind == "LogRepeated"
+    assert isinstance(second, FleetFit)
+    assert isinstance(third, Failure)
+    assert third.kind == "LogsDiffer"
+
+    log, *others = cells[1].fit
+    changed_log = replace(log, fingerprint="0" * 64)
+    stale = replace(cells[1], fit=(changed_log, *others))
     made = fit_cell(stale, Loop.OPEN, CREATED)
     assert isinstance(made, Failure)
     assert "another content" in made.text
@@ -733,55 +814,71 @@ def test_no_more_is_in_work_than_there_are_workers(workers: int, pieces: int) ->
         for piece, made in each(submit, range(pieces), pool):
             results[piece] = made
             back += 1
-    expected = {piece: piece**2 for piece in range(pieces)}
-    assert results == expected
+    squares = {piece: piece**2 for piece in range(pieces)}
+    assert results == squares
     # The next one goes out before the finished one is examined.
     assert most <= workers + 1
 
 
 def _seen_logs() -> st.SearchStrategy[list[SeenLog]]:
+    same_log = st.just(StoredLog("", ""))
+    same_fingerprint = st.just("")
+    cells = st.sampled_from(("a", "b"))
+    configurations = st.sampled_from(("1", "2"))
+    mountings = st.sampled_from((None, "x", "y"))
+    times_ns = st.integers(0, 5)
     one = st.builds(
         SeenLog,
-        log=st.just(StoredLog("", "")),
-        fingerprint=st.just(""),
-        cell=st.sampled_from(("a", "b")),
-        configuration_sha256=st.sampled_from(("1", "2")),
-        mounting=st.sampled_from((None, "x", "y")),
-        started_ns=st.integers(0, 5),
+        log=same_log,
+        fingerprint=same_fingerprint,
+        cell=cells,
+        configuration_sha256=configurations,
+        mounting=mountings,
+        started_ns=times_ns,
     )
-    return st.lists(one, max_size=12).map(
-        lambda logs: [
-            replace(log, log=StoredLog(f"/{number}", str(number)), fingerprint=f"{number:064x}")
-            for number, log in enumerate(logs)
-        ]
-    )
+
+    def numbered(logs: list[SeenLog]) -> list[SeenLog]:
+        changed = []
+        for number, log in enumerate(logs):
+            stored = StoredLog(f"/{number}", str(number))
+            fingerprint = f"{number:064x}"
+            changed.append(replace(log, log=stored, fingerprint=fingerprint))
+        return changed
+
+    return st.lists(one, max_size=12).map(numbered)
 
 
 @given(_seen_logs(), st.randoms(use_true_random=False))
 def test_every_log_has_one_role_in_one_cell(logs: list[SeenLog], random: Any) -> None:
     cells = by_cell(logs)
-    used: list[str] = []
+
+    used: list[SeenLog] = []
+    identities = []
     for cell in cells:
-        used.extend(seen.log.name for seen in (*cell.fit, *cell.holdout))
-    assert sorted(used) == sorted(seen.log.name for seen in logs)
-    assert len({(cell.cell, cell.configuration_sha256) for cell in cells}) == len(cells)
+        logs_of_cell = (*cell.fit, *cell.holdout)
+        used.extend(logs_of_cell)
+        identity = (cell.cell, cell.configuration_sha256)
+        identities.append(identity)
+        logs_identities = {(seen.cell, seen.configuration_sha256) for seen in logs_of_cell}
+        assert logs_identities == {identity}
+    used_names = sorted(seen.log.name for seen in used)
+    names = sorted(seen.log.name for seen in logs)
+    assert used_names == names
+    assert len(set(identities)) == len(cells)
+
     for cell in cells:
-        expected = {(cell.cell, cell.configuration_sha256)}
-        assert {
-            (seen.cell, seen.configuration_sha256) for seen in (*cell.fit, *cell.holdout)
-        } == expected
         fitted = [seen.mounting for seen in cell.fit]
+        with_payload = [seen for seen in cell.fit if seen.mounting is not None]
         assert len(cell.holdout) <= 1
-        for held in cell.holdout:
-            assert held.mounting is not None
-            assert {held.mounting, None} <= set(fitted)
-            assert all(
-                seen.started_ns <= held.started_ns for seen in cell.fit if seen.mounting is not None
-            )
+        for held_out in cell.holdout:
+            assert held_out.mounting is not None
+            assert {held_out.mounting, None} <= set(fitted)
+            for seen in with_payload:
+                assert seen.started_ns <= held_out.started_ns
         if not cell.holdout and None in fitted:
-            mountings = [mounting for mounting in fitted if mounting is not None]
-            newest = mountings[-1:]
-            assert all(fitted.count(mounting) == 1 for mounting in newest)
+            for newest in with_payload[-1:]:
+                assert fitted.count(newest.mounting) == 1
+
     shuffled = list(logs)
     random.shuffle(shuffled)
     assert by_cell(shuffled) == cells

@@ -10,7 +10,7 @@ import json
 import os
 import re
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -52,21 +52,29 @@ from tests.daq.histories import (
 )
 
 FLAT = (1.0,) * 6
+Factors = tuple[float, ...]
 
 
-def drifting(week: int) -> tuple[float, ...]:
+def _of_j4(factor: float) -> Factors:
+    """The gain of J4 by this factor, the others by 1."""
+    return (1.0, 1.0, 1.0, factor, 1.0, 1.0)
+
+
+def drifting(week: int) -> Factors:
     """J4 loses 6 % from the 14th calibration on, in twelve weeks."""
-    largest_week = max(week - 13, 0)
-    smallest = min(largest_week / 12.0, 1.0)
-    return (1.0, 1.0, 1.0, 1.0 - 0.06 * smallest, 1.0, 1.0)
+    weeks_of_drift = max(week - 13, 0)
+    drift_share = min(weeks_of_drift / 12.0, 1.0)
+    factor = 1.0 - 0.06 * drift_share
+    return _of_j4(factor)
 
 
-def sloping(week: int) -> tuple[float, ...]:
+def sloping(week: int) -> Factors:
     """J4 loses 0.2 % a week from the first calibration on."""
-    return (1.0, 1.0, 1.0, 1.0 - 0.002 * week, 1.0, 1.0)
+    factor = 1.0 - 0.002 * week
+    return _of_j4(factor)
 
 
-def stepping(factors: tuple[float, ...]) -> Callable[[int], tuple[float, ...]]:
+def stepping(factors: Factors) -> Callable[[int], Factors]:
     """All gains by their factors from the 15th calibration on."""
     return lambda week: factors if week > 14 else FLAT
 
@@ -77,13 +85,19 @@ def _place(cell_file: Path) -> HistoryPlace:
     return place
 
 
-_audits: dict[tuple[tuple[float, ...], ...], tuple[tuple[str, ...], bytes]] = {}
-"""Digests of the calibrations and content of the file, by the true factors of each week."""
+@dataclass(frozen=True)
+class _FilledAudit:
+    """Digests of the calibrations, and content of the file."""
+
+    digests: tuple[str, ...]
+    content: bytes
 
 
-def _filled(
-    cell_file: Path, weeks: int, true: Callable[[int], tuple[float, ...]]
-) -> tuple[str, ...]:
+_audits: dict[tuple[Factors, ...], _FilledAudit] = {}
+"""Filled ones, by the true factors of each week."""
+
+
+def _filled(cell_file: Path, weeks: int, true: Callable[[int], Factors]) -> tuple[str, ...]:
     """Fill the history, which has no file yet; the digests of its calibrations.
 
     Equal ones are filled once.
@@ -93,10 +107,10 @@ def _filled(
     assert not path.exists()
     if key not in _audits:
         digests = fill(ledger_of(cell_file), weeks, true)
-        _audits[key] = digests, path.read_bytes()
-    digests, content = _audits[key]
-    path.write_bytes(content)
-    return digests
+        _audits[key] = _FilledAudit(digests, path.read_bytes())
+    filled = _audits[key]
+    path.write_bytes(filled.content)
+    return filled.digests
 
 
 def _series(cell_file: Path) -> tuple[Series, ...]:
@@ -104,11 +118,37 @@ def _series(cell_file: Path) -> tuple[Series, ...]:
     return watch(history.entries, history.acknowledgements)
 
 
-def _json(capsys: pytest.CaptureFixture[str], *arguments: str) -> dict[str, Any]:
-    assert main(["history", *arguments, "--json"]) == 0
+def _history(cell_file: Path, *arguments: str | Path) -> int:
+    """Run `drivegain history` on the cell; its exit code."""
+    texts = [str(argument) for argument in arguments]
+    return main(["history", str(cell_file), *texts])
+
+
+def _json(capsys: pytest.CaptureFixture[str], cell_file: Path, *arguments: str) -> dict[str, Any]:
+    assert _history(cell_file, *arguments, "--json") == 0
     printed = capsys.readouterr().out
     found: dict[str, Any] = json.loads(printed)
     return found
+
+
+def _one_spaced(text: str) -> str:
+    """The words of a text, one space between them."""
+    return " ".join(text.split())
+
+
+def _dispersions(cell_file: Path) -> dict[str, float]:
+    """Those of the charts."""
+    return {series.axis: series.dispersion for series in _series(cell_file)}
+
+
+def _with_first_gain_fixed(calibration: Calibration) -> Calibration:
+    first, *others = calibration.gains
+    fixed = replace(first, std=0.0)
+    return replace(calibration, gains=(fixed, *others))
+
+
+def _event_facts(event: Event) -> tuple[Any, ...]:
+    return (event.action, event.at, event.who, event.audit)
 
 
 def _entry(digest: str) -> Entry:
@@ -124,13 +164,13 @@ def _put(cell_file: Path, digest: str) -> str:
     assert controller is not None
     entries = history_of(cell_file).entries
     (entry,) = [one for one in entries if one.digest == digest]
-    keys = {gain.axis: f"drives.{gain.axis}.gain" for gain in entry.gains}
+    keys = tuple(f"drives.{gain.axis}.gain" for gain in entry.gains)
     document = read_controller(controller.read_bytes(), controller.name)
-    scalars = document.locate(tuple(keys.values()))
-    spelling = {
-        s.key: rewrite_gain(s, g.value, g.std).spelling
-        for s, g in zip(scalars, entry.gains, strict=True)
-    }
+    scalars = document.locate(keys)
+    spelling = {}
+    for scalar, gain in zip(scalars, entry.gains, strict=True):
+        rewritten = rewrite_gain(scalar, gain.value, gain.std)
+        spelling[scalar.key] = rewritten.spelling
     controller.write_bytes(document.with_values(spelling).content)
     return str(controller.resolve())
 
@@ -138,15 +178,16 @@ def _put(cell_file: Path, digest: str) -> str:
 def test_an_empty_history_says_what_to_do(
     cell_file: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["history", str(cell_file)]) == 0
+    assert _history(cell_file) == 0
     assert "The history is empty" in capsys.readouterr().out
-    axes = _json(capsys, str(cell_file))["axes"]
+    axes = _json(capsys, cell_file)["axes"]
     assert axes == []
-    assert main(["history", str(cell_file), "--verify"]) == 0
+    assert _history(cell_file, "--verify") == 0
     assert "0 entries, chain unbroken" in capsys.readouterr().out
     assert not _place(cell_file).audit.exists()
-    assert main(["history", str(cell_file), "--axis", "J4"]) == 2
-    assert main(["history", str(cell_file), "--plot", str(cell_file.with_suffix(".png"))]) == 2
+    assert _history(cell_file, "--axis", "J4") == 2
+    picture = cell_file.with_suffix(".png")
+    assert _history(cell_file, "--plot", picture) == 2
 
 
 def test_a_calibration_is_entered_by_hand(
@@ -154,19 +195,20 @@ def test_a_calibration_is_entered_by_hand(
 ) -> None:
     file = cell_file.parent / "calibration.yaml"
     save_calibration(calibration_of(0), file)
-    assert main(["history", str(cell_file), "--add", str(file)]) == 0
+    assert _history(cell_file, "--add", file) == 0
     shown = capsys.readouterr()
     assert "entered" in shown.err
     assert "33.90 ± 0.14" in shown.out
     assert "baseline: 1 of 12" in shown.out
-    assert main(["history", str(cell_file), "--add", str(file)]) == 0
+    assert _history(cell_file, "--add", file) == 0
     assert "already" in capsys.readouterr().err
     calibration = replace(calibration_of(1), cell="another")
     save_calibration(calibration, file)
-    assert main(["history", str(cell_file), "--add", str(file)]) == 4
+    assert _history(cell_file, "--add", file) == 4
     assert "another" in capsys.readouterr().err
-    assert main(["history", str(cell_file), "--add", str(cell_file)]) == 4
-    assert main(["history", str(cell_file), "--add", str(file) + ".none"]) == 4
+    assert _history(cell_file, "--add", cell_file) == 4
+    missing = f"{file}.none"
+    assert _history(cell_file, "--add", missing) == 4
     points = _series(cell_file)[0].points
     assert len(points) == 1
 
@@ -176,26 +218,34 @@ def test_a_drift_is_reported_with_its_time_its_size_and_a_question(
     cell_file: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     digests = _filled(cell_file, 26, drifting)
-    write(ledger_of(cell_file), "x.yaml", "1", digest=digests[8], at=BEGIN + timedelta(weeks=8))
+    written = BEGIN + timedelta(weeks=8)
+    write(ledger_of(cell_file), "x.yaml", "1", digest=digests[8], at=written)
     _put(cell_file, digests[8])
-    assert main(["history", str(cell_file)]) == 0
+    assert _history(cell_file) == 0
     printed = capsys.readouterr().out
-    out = " ".join(printed.split())
+    out = _one_spaced(printed)
     assert re.search(r"ALARM: gain of J4 fell 5\.\d % since 2026-04-\d\d, \d\d\.\d σ", out)
     assert out.count("ALARM:") == 1
     assert "demagnetised" in out
     assert "Worn teeth alone do not change a ratio" in out
     assert "applied by anna, in force" in out
-    found = _json(capsys, str(cell_file), "--axis", "J4")
+
+    found = _json(capsys, cell_file, "--axis", "J4")
     (axis,) = found["axes"]
     assert found["pattern"] == "one axis"
     assert axis["alarmed"]
-    assert axis["change_percent"] == pytest.approx(-5.7, abs=0.5)
+    percent = axis["change_percent"]
+    assert percent == pytest.approx(-5.7, abs=0.5)
+
     # 6 % in twelve weeks with σ 0.4 % have cumulated 3 σ after three.
-    first = next(number for number, point in enumerate(axis["points"]) if point["alarm"])
+    alarms = [bool(point["alarm"]) for point in axis["points"]]
+    first = alarms.index(True)
     assert 15 <= first <= 18
+
     assert found["in_force"] == digests[8]
-    assert [point["applied_by"] for point in axis["points"] if point["applied_by"]] == ["anna"]
+    writers = [point["applied_by"] for point in axis["points"]]
+    names = [name for name in writers if name]
+    assert names == ["anna"]
 
 
 @pytest.mark.slow
@@ -203,27 +253,29 @@ def test_a_drift_from_the_first_day_is_reported_as_steady(
     cell_file: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     _filled(cell_file, 9, sloping)
-    assert main(["history", str(cell_file), "--axis", "J4"]) == 0
+    assert _history(cell_file, "--axis", "J4") == 0
     printed = capsys.readouterr().out
-    out = " ".join(printed.split())
+    out = _one_spaced(printed)
     reported = re.search(
         r"ALARM: gain of J4 falls steadily since 2026-01-05, (\d\.\d) % until "
         r"now, (\d\.\d) σ",
         out,
     )
     assert reported is not None
-    assert float(reported[1]) == pytest.approx(1.6, abs=1.0)  # 8 × 0.2 %, and its σ is 0.5 %
+    percent = float(reported[1])
+    sigmas = float(reported[2])
+    assert percent == pytest.approx(1.6, abs=1.0)  # 8 × 0.2 %, and its σ is 0.5 %
     assert "demagnetised" in out
-    found = _json(capsys, str(cell_file), "--axis", "J4")
+    found = _json(capsys, cell_file, "--axis", "J4")
     points = found["axes"][0]["points"]
     point = points[-1]
     assert point["alarm"] == "trend"
     absolute_trend_sigma = abs(point["trend_sigmas"])
-    assert absolute_trend_sigma == pytest.approx(float(reported[2]), abs=0.05)
+    assert absolute_trend_sigma == pytest.approx(sigmas, abs=0.05)
     trend = found["chart"]["trend"]
     assert point["trend_sigmas"] < -trend
     picture = cell_file.parent / "history.svg"
-    assert main(["history", str(cell_file), "--plot", str(picture)]) == 0
+    assert _history(cell_file, "--plot", picture) == 0
     assert b"steady change" in picture.read_bytes()
 
 
@@ -234,14 +286,27 @@ def test_an_alarm_that_has_passed_has_no_date(
     """5 % on one day, the fourth: its row keeps the alarm,
     and the rest of the gain is as of any other.
     """
-    _filled(cell_file, 20, lambda week: (1.0, 1.0, 1.0, 0.95 if week == 3 else 1.0, 1.0, 1.0))
+
+    def fourth_day(week: int) -> Factors:
+        factor = 0.95 if week == 3 else 1.0
+        return _of_j4(factor)
+
+    _filled(cell_file, 20, fourth_day)
+
     series = _series(cell_file)[3]
     assert series.alarm_at(3) is not None
-    assert (series.alarmed, series.onset, alarm_text(series)) == (False, None, None)
-    (axis,) = _json(capsys, str(cell_file), "--axis", "J4")["axes"]
-    assert (axis["alarmed"], axis["alarm"], axis["since"]) == (False, None, None)
-    known = [point.gain.value for point in series.points[:12]]
-    stds = [point.gain.std for point in series.points[:12]]
+    assert series.alarmed is False
+    assert series.onset is None
+    assert alarm_text(series) is None
+
+    found = _json(capsys, cell_file, "--axis", "J4")
+    (axis,) = found["axes"]
+    assert axis["alarmed"] is False
+    assert axis["alarm"] is None
+    assert axis["since"] is None
+    gains = [point.gain for point in series.points[:12]]
+    known = [gain.value for gain in gains]
+    stds = [gain.std for gain in gains]
     weights = np.array(stds) ** -2.0
     mean_known = np.average(known, weights=weights)
     assert axis["baseline"] == pytest.approx(mean_known)
@@ -252,11 +317,12 @@ def test_without_a_drift_there_is_no_alarm(
     cell_file: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     _filled(cell_file, 25, lambda _: FLAT)
-    assert main(["history", str(cell_file)]) == 0
+    assert _history(cell_file) == 0
     out = capsys.readouterr().out
     assert "No alarm." in out
     assert "ALARM" not in out
-    assert _json(capsys, str(cell_file))["questions"] == []
+    found = _json(capsys, cell_file)
+    assert found["questions"] == []
 
 
 @pytest.mark.parametrize(
@@ -268,9 +334,7 @@ def test_without_a_drift_there_is_no_alarm(
         ((1.0, 0.95, 1.0, 1.05, 1.0, 1.0), "several axes, each by an amount of its own"),
     ],
 )
-def test_each_pattern_has_its_question(
-    cell_file: Path, factors: tuple[float, ...], says: str
-) -> None:
+def test_each_pattern_has_its_question(cell_file: Path, factors: Factors, says: str) -> None:
     _filled(cell_file, 20, stepping(factors))
     assert says in questions(_series(cell_file))[0]
 
@@ -278,10 +342,9 @@ def test_each_pattern_has_its_question(
 def test_a_configuration_that_changed_is_asked_for(cell_file: Path) -> None:
     factors = (0.96,) * 6
     _filled(cell_file, 20, stepping(factors))
-    enter(
-        ledger_of(cell_file),
-        replace(calibration_of(20, (0.96,) * 6), configuration_sha256="d" * 64),
-    )
+    calibration = calibration_of(20, factors)
+    configured = replace(calibration, configuration_sha256="d" * 64)
+    enter(ledger_of(cell_file), configured)
     assert "configuration changed" in questions(_series(cell_file))[1]
 
 
@@ -301,13 +364,12 @@ def test_the_same_logs_fitted_again_are_no_other_day(cell_file: Path) -> None:
     the newest that was applied, else the newest.
     """
     logs = calibration_of(0).sources
-    fits = [
-        replace(
-            calibration_of(week, (1.0 + 0.001 * week,) * 6),
-            sources=logs[::-1] if week % 2 else logs,
-        )
-        for week in range(12)
-    ]
+    fits = []
+    for week in range(12):
+        factor = 1.0 + 0.001 * week
+        calibration = calibration_of(week, (factor,) * 6)
+        sources = logs[::-1] if week % 2 else logs
+        fits.append(replace(calibration, sources=sources))
     ledger = ledger_of(cell_file)
 
     def points() -> tuple[Point, ...]:
@@ -322,19 +384,24 @@ def test_the_same_logs_fitted_again_are_no_other_day(cell_file: Path) -> None:
     assert point.entry.recorded == BEGIN
     write(ledger, "x.yaml", "1", digest=digests[4])
     enter(ledger, calibration_of(1))
-    assert [point.entry.digest for point in points()] == [digests[4], digest_of(calibration_of(1))]
-    gains = fits[0].gains
-    held = tuple(replace(gain, std=0.0) for gain in gains)
+    next_day = digest_of(calibration_of(1))
+    charted = [point.entry.digest for point in points()]
+    assert charted == [digests[4], next_day]
+
     # Knows no gain, hides none
+    gains = fits[0].gains
+    fixed = tuple(replace(gain, std=0.0) for gain in gains)
     sources = calibration_of(1).sources
-    changed_fit = replace(fits[0], gains=held, sources=sources)
+    changed_fit = replace(fits[0], gains=fixed, sources=sources)
     enter(ledger, changed_fit)
     digest = points()[1].entry.digest
-    assert digest == digest_of(calibration_of(1))
+    assert digest == next_day
+
     # Another log held out is another question to the same recordings.
     sha256 = "9" * 64
     changed_log = replace(logs[2], sha256=sha256)
-    other = replace(fits[0], sources=(*logs[:2], changed_log))
+    other_sources = (*logs[:2], changed_log)
+    other = replace(fits[0], sources=other_sources)
     assert logs_of(other, "") == logs_of(fits[0], "")
     calibration = replace(fits[0], sources=())
     assert logs_of(calibration, "its own") == "its own"
@@ -345,17 +412,18 @@ def test_old_logs_fitted_today_report_their_own_time(cell_file: Path) -> None:
     _filled(cell_file, 20, lambda _: FLAT)
     factors = (0.9,) * 6
     calibration = calibration_of(30, factors)
-    begin_difference = BEGIN - timedelta(days=400)
-    year_ago = recorded(calibration, begin_difference)
+    time_of_logs = BEGIN - timedelta(days=400)
+    year_ago = recorded(calibration, time_of_logs)
     enter(ledger_of(cell_file), year_ago)
     last_entry = history_of(cell_file).entries[-1]
     assert last_entry.digest == digest_of(year_ago)  # fitted last
     series = _series(cell_file)[3]
     digest = series.points[0].entry.digest
     assert digest == digest_of(year_ago)
-    expected = [BEGIN - timedelta(days=400), BEGIN]
-    assert [point.entry.recorded for point in series.points[:2]] == expected
-    assert series.onset is None or series.onset < BEGIN + timedelta(weeks=1)
+    times = [point.entry.recorded for point in series.points[:2]]
+    assert times == [time_of_logs, BEGIN]
+    second_week = BEGIN + timedelta(weeks=1)
+    assert series.onset is None or series.onset < second_week
 
 
 @pytest.mark.parametrize("recorded_s", [None, float("nan"), 1e300])
@@ -368,15 +436,12 @@ def test_a_gain_that_was_held_fixed_knows_nothing(
     cell_file: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     _filled(cell_file, 3, lambda _: FLAT)
-    fixed = calibration_of(5)
-    enter(
-        ledger_of(cell_file),
-        replace(fixed, gains=(replace(fixed.gains[0], std=0.0), *fixed.gains[1:])),
-    )
-    point_counts = [len(series.points) for series in _series(cell_file)]
-    expected = [3, 4, 4, 4, 4, 4]
-    assert point_counts == expected
-    assert main(["history", str(cell_file)]) == 0
+    fixed = _with_first_gain_fixed(calibration_of(5))
+    enter(ledger_of(cell_file), fixed)
+    charts = _series(cell_file)
+    point_counts = [len(series.points) for series in charts]
+    assert point_counts == [3, 4, 4, 4, 4, 4]
+    assert _history(cell_file) == 0
     assert "J1" in capsys.readouterr().out
 
 
@@ -391,10 +456,11 @@ def _job_s_dispersions(cell_file: Path, own: Calibration | None = None) -> dict[
         save_calibration(own, file)
         digest = sha256_of(file) or ""
         enter_calibration(ledger_of(cell_file), own, digest=digest, who="job", at=BEGIN)
-    changes = [
-        GainChange(name, name, 1, 1.0, 1.0, 0.1, "Nm/A", 1.0, "") for name in declared.axis_names
-    ]
-    known = known_of(history_of(cell_file), str(resolve_links(controller)), digest, changes)
+    changes = []
+    for name in declared.axis_names:
+        changes.append(GainChange(name, name, 1, 1.0, 1.0, 0.1, "Nm/A", 1.0, ""))
+    target = str(resolve_links(controller))
+    known = known_of(history_of(cell_file), target, digest, changes)
     return dict(known.dispersions)
 
 
@@ -402,62 +468,71 @@ def test_a_job_and_the_charts_know_one_scatter(cell_file: Path) -> None:
     """Also where a session was fitted again with a gain held fixed,
     and where that is its only fit.
     """
-    _filled(cell_file, 12, lambda week: (1.0 + 0.012 * (-1) ** week,) * 6)
-    before = {series.axis: series.dispersion for series in _series(cell_file)}
+
+    def scattering(week: int) -> Factors:
+        factor = 1.0 + 0.012 * (-1) ** week
+        return (factor,) * 6
+
+    _filled(cell_file, 12, scattering)
+    before = _dispersions(cell_file)
     assert min(before.values()) > 1.5
     assert _job_s_dispersions(cell_file) == before
+
     factors = (1.0 - 0.012,) * 6
-    fitted = calibration_of(5, factors)
-    changed_gain = replace(fitted.gains[0], std=0.0)
-    gains = (changed_gain, *fitted.gains[1:])
-    again = replace(fitted, gains=gains)
+    again = _with_first_gain_fixed(calibration_of(5, factors))
     enter(ledger_of(cell_file), again)
     charts = _series(cell_file)
     point_counts = [len(series.points) for series in charts]
     assert point_counts == [12] * 6
-    refitted = {series.axis: series.dispersion for series in charts}
+    refitted = _dispersions(cell_file)
     assert _job_s_dispersions(cell_file) == refitted
     assert refitted == pytest.approx(before, rel=0.05)  # the same recordings of all axes as before
-    alone = calibration_of(12)
-    enter(
-        ledger_of(cell_file),
-        replace(alone, gains=(replace(alone.gains[0], std=0.0), *alone.gains[1:])),
-    )
+
+    alone = _with_first_gain_fixed(calibration_of(12))
+    enter(ledger_of(cell_file), alone)
     charts = _series(cell_file)
-    expected = [12, 13, 13, 13, 13, 13]
-    assert [len(series.points) for series in charts] == expected
-    found = {series.axis: series.dispersion for series in charts}
+    point_counts = [len(series.points) for series in charts]
+    assert point_counts == [12, 13, 13, 13, 13, 13]
+    found = _dispersions(cell_file)
     assert _job_s_dispersions(cell_file) == found
+
     # What a session has found itself is not what it is judged by.
     own = calibration_of(13, (1.2,) * 6)
     assert _job_s_dispersions(cell_file, own) == found
-    assert {series.axis: series.dispersion for series in _series(cell_file)} != found
+    assert _dispersions(cell_file) != found
 
 
 def test_the_scatter_of_axes_is_reported_together_where_the_same_recordings_know_them() -> None:
     rng = np.random.default_rng(12)
-    names = tuple(f"J{number}" for number in range(1, 4))
+    names = ("J1", "J2", "J3")
     values = rng.normal(10.0, 0.3, (9, 3))
     stds_nm_per_a = np.full(values.shape, 0.1)
     stds_nm_per_a[4, 2] = 0.0  # J3 was held fixed once.
     entries = []
     for week, row in enumerate(values):
-        gains = [
-            Gain(axis, float(value), float(std), "Nm/A", 10.0)
-            for axis, value, std in zip(names, row, stds_nm_per_a[week], strict=True)
-        ]
+        gains = []
+        for axis, value, std in zip(names, row, stds_nm_per_a[week], strict=True):
+            gains.append(Gain(axis, float(value), float(std), "Nm/A", 10.0))
         entry = _entry(str(week))
         recorded = BEGIN + timedelta(weeks=week)
-        entries.append(replace(entry, logs=str(week), recorded=recorded, gains=tuple(gains)))
+        week_entry = replace(entry, logs=str(week), recorded=recorded, gains=tuple(gains))
+        entries.append(week_entry)
+
     found = dispersions_of(entries, names)
+
     assert tuple(found) == names
-    expected = dispersions(values[:, :2].T, np.full((2, 9), 0.1))
-    np.testing.assert_allclose([found["J1"], found["J2"]], expected)
-    alone = np.delete(values[:, 2], 4)
+    stds = np.full((2, 9), 0.1)
+    together = dispersions(values[:, :2].T, stds)
+    found_together = [found["J1"], found["J2"]]
+    np.testing.assert_allclose(found_together, together)
+    without_fixed = np.delete(values[:, 2], 4)
     stds = np.full((1, 8), 0.1)
-    np.testing.assert_allclose(found["J3"], dispersions([alone], stds)[0])
-    assert dispersions_of(entries[:4], names) == dict.fromkeys(names, DISPERSION)
-    assert dispersions_of((), names) == dict.fromkeys(names, DISPERSION)
+    (alone,) = dispersions([without_fixed], stds)
+    np.testing.assert_allclose(found["J3"], alone)
+
+    of_few_recordings = dict.fromkeys(names, DISPERSION)
+    assert dispersions_of(entries[:4], names) == of_few_recordings
+    assert dispersions_of((), names) == of_few_recordings
     assert dispersions_of(entries, ("J9",)) == {"J9": DISPERSION}
     assert dispersions_of(entries, ()) == {}
 
@@ -466,101 +541,90 @@ def test_an_axis_has_a_table_of_its_own(
     cell_file: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     _filled(cell_file, 5, lambda _: FLAT)
-    assert main(["history", str(cell_file), "--axis", "J4"]) == 0
+    assert _history(cell_file, "--axis", "J4") == 0
     out = capsys.readouterr().out
     assert out.count("2026-0") == 5
     assert "CUSUM" in out
     assert "No alarm" in out
-    assert main(["history", str(cell_file), "--axis", "J9"]) == 2
+    assert _history(cell_file, "--axis", "J9") == 2
     error_output = capsys.readouterr().err
-    assert "one of J1" in " ".join(error_output.split())
+    assert "one of J1" in _one_spaced(error_output)
 
 
 def test_a_change_that_is_explained_begins_a_new_baseline(
     cell_file: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     _filled(cell_file, 26, drifting)
-    explain = [
-        "history",
-        str(cell_file),
-        "--acknowledge",
-        "J4",
-        "--by",
-        "anna",
-        "--why",
-        "gearbox changed",
-    ]
-    assert main(explain) == 0
+    why = ("--why", "gearbox changed")
+    assert _history(cell_file, "--acknowledge", "J4", "--by", "anna", *why) == 0
     capsys.readouterr()
     series = _series(cell_file)[3]
     assert not series.alarmed
     assert series.began == 25
-    assert [stretch.began for stretch in series.stretches] == [0, 25]
+    begins = [stretch.began for stretch in series.stretches]
+    assert begins == [0, 25]
     assert series.alarm_at(24) is not None  # a shown alarm stays
-    assert not any(other.acknowledged for other in _series(cell_file) if other.axis != "J4")
+    charts = _series(cell_file)
+    others = [other for other in charts if other.axis != "J4"]
+    assert not any(other.acknowledged for other in others)
     path = _place(cell_file).audit
     entry = read(path)[-1]
     assert entry.action is AuditAction.ACKNOWLEDGED
     assert entry.who.startswith("anna")
     assert entry.details["why"] == "gearbox changed"
-    assert main(["history", str(cell_file), "--axis", "J4"]) == 0
+    assert _history(cell_file, "--axis", "J4") == 0
     assert "gearbox changed" in capsys.readouterr().out
-    assert main(["history", str(cell_file), "--verify"]) == 0
+    assert _history(cell_file, "--verify") == 0
     # The next calibrations at the new level are compared with that level.
     for week in range(26, 30):
-        enter(ledger_of(cell_file), calibration_of(week, drifting(week)))
+        calibration = calibration_of(week, drifting(week))
+        enter(ledger_of(cell_file), calibration)
     assert not _series(cell_file)[3].alarmed
 
 
 def test_a_new_baseline_begins_where_one_says(cell_file: Path) -> None:
     factors = (1.0, 1.0, 1.0, 0.9, 1.0, 1.0)
     _filled(cell_file, 20, stepping(factors))
-    explain = [
-        "history",
-        str(cell_file),
-        "--acknowledge",
-        "J4",
-        "--why",
-        "motor exchanged",
-        "--since",
-    ]
-    assert main([*explain, "someday"]) == 2
-    assert main([*explain, (BEGIN + timedelta(weeks=15)).date().isoformat()]) == 0
+    explain = ("--acknowledge", "J4", "--why", "motor exchanged", "--since")
+    assert _history(cell_file, *explain, "someday") == 2
+    exchanged = BEGIN + timedelta(weeks=15)
+    day = exchanged.date().isoformat()
+    assert _history(cell_file, *explain, day) == 0
     series = _series(cell_file)[3]
     assert series.began == 15
     assert not series.alarmed
+
     # A baseline that is still to come would silence the axis until then.
-    acknowledge(
-        ledger_of(cell_file), "J4", since=BEGIN.replace(year=2130), at=BEGIN, who="anna", why="x"
-    )
+    to_come = BEGIN.replace(year=2130)
+    ledger = ledger_of(cell_file)
+    acknowledge(ledger, "J4", since=to_come, at=BEGIN, who="anna", why="x")
     assert _series(cell_file)[3].acknowledged == series.acknowledged
+
     # One that began after the newest recording.
-    acknowledge(
-        ledger_of(cell_file),
-        "J4",
-        since=BEGIN.replace(year=2130),
-        at=BEGIN.replace(year=2130),
-        who="a",
-        why="x",
-    )
+    acknowledge(ledger, "J4", since=to_come, at=to_come, who="a", why="x")
     series = _series(cell_file)[3]
-    assert (series.began, series.drift, series.onset, alarm_text(series)) == (20, None, None, None)
-    assert main(["history", str(cell_file), "--axis", "J4"]) == 0
+    assert series.began == 20
+    assert series.drift is None
+    assert series.onset is None
+    assert alarm_text(series) is None
+    assert _history(cell_file, "--axis", "J4") == 0
 
 
 def test_a_baseline_that_begins_later_than_now_is_refused(
     cell_file: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     _filled(cell_file, 3, lambda _: FLAT)
-    explain = ["history", str(cell_file), "--acknowledge", "J4", "--why", "planned", "--since"]
-    assert main([*explain, "2130-01-02T03:04:05+01:00"]) == 2
+    explain = ("--acknowledge", "J4", "--why", "planned", "--since")
+    assert _history(cell_file, *explain, "2130-01-02T03:04:05+01:00") == 2
     error_output = capsys.readouterr().err
-    output = " ".join(error_output.split())
+    output = _one_spaced(error_output)
     assert "2130-01-02 02:04:05 UTC" in output
-    assert f"no later than now, {datetime.now(UTC):%Y-%m-%d}" in output
+    now = datetime.now(UTC)
+    assert f"no later than now, {now:%Y-%m-%d}" in output
     path = _place(cell_file).audit
     assert len(read(path)) == 3
-    assert main([*explain, datetime.now(UTC).date().isoformat()]) == 0
+    today = datetime.now(UTC).date().isoformat()
+    assert _history(cell_file, *explain, today) == 0
 
 
 def test_a_log_of_tomorrow_begins_its_baseline_now(
@@ -570,9 +634,10 @@ def test_a_log_of_tomorrow_begins_its_baseline_now(
     days = (datetime.now(UTC) - BEGIN).days
     weeks = days // 7 + 2
     enter(ledger_of(cell_file), calibration_of(weeks))
-    assert main(["history", str(cell_file), "--acknowledge", "J4", "--why", "motor exchanged"]) == 0
+    explain = ("--acknowledge", "J4", "--why", "motor exchanged")
+    assert _history(cell_file, *explain) == 0
     assert _series(cell_file)[3].began == 0
-    assert main(["history", str(cell_file), "--verify"]) == 0
+    assert _history(cell_file, "--verify") == 0
     capsys.readouterr()
 
 
@@ -589,7 +654,7 @@ def test_a_log_of_tomorrow_begins_its_baseline_now(
 )
 def test_an_explanation_without_its_parts_is_refused(cell_file: Path, arguments: list[str]) -> None:
     _filled(cell_file, 3, lambda _: FLAT)
-    assert main(["history", str(cell_file), *arguments]) == 2
+    assert _history(cell_file, *arguments) == 2
     path = _place(cell_file).audit
     assert len(read(path)) == 3
 
@@ -598,23 +663,27 @@ def test_an_explanation_without_its_parts_is_refused(cell_file: Path, arguments:
 def test_the_table_leaves_as_csv(cell_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
     _filled(cell_file, 15, drifting)
     out = cell_file.parent / "history.csv"
-    assert main(["history", str(cell_file), "--csv", str(out)]) == 0
-    assert main(["history", str(cell_file), "--csv", str(out)]) == 0  # an earlier one is replaced
+    assert _history(cell_file, "--csv", out) == 0
+    assert _history(cell_file, "--csv", out) == 0  # an earlier one is replaced
     with out.open(newline="") as stream:
         rows = list(csv.DictReader(stream))
     assert tuple(rows[0]) == COLUMNS
-    assert [row["axis"] for row in rows[::15]] == list(AXES)
+    axes = [row["axis"] for row in rows[::15]]
+    assert axes == list(AXES)
     found = {series.axis: series for series in _series(cell_file)}
     points = found["J4"].points
-    for row, point in zip(rows[45:60], points, strict=True):
+    rows_of_j4 = rows[45:60]
+    for row, point in zip(rows_of_j4, points, strict=True):
         gain = float(row["gain"])
+        created = datetime.fromisoformat(row["created"])
         assert gain == point.gain.value
-        assert datetime.fromisoformat(row["created"]) == point.entry.created
+        assert created == point.entry.created
         assert row["unit"] == "Nm/A"
     assert rows[0]["change_percent"] == ""
     capsys.readouterr()
-    assert main(["history", str(cell_file), "--csv", str(cell_file)]) == 2
-    assert cell_file.read_bytes().startswith(b"#") or b"axes" in cell_file.read_bytes()
+    assert _history(cell_file, "--csv", cell_file) == 2
+    content = cell_file.read_bytes()
+    assert content.startswith(b"#") or b"axes" in content
 
 
 @pytest.mark.slow
@@ -625,12 +694,12 @@ def test_the_picture_is_drawn_the_same_each_time(
 ) -> None:
     _filled(cell_file, 26, drifting)
     out = cell_file.parent / f"history{suffix}"
-    draw = ["history", str(cell_file), "--plot", str(out), *arguments]
-    assert main(draw) == 0
+    assert _history(cell_file, "--plot", out, *arguments) == 0
     first = out.read_bytes()
     assert len(first) > 10_000
-    assert first.startswith({".png": b"\x89PNG", ".svg": b"<?xml"}[suffix])
-    assert main(draw) == 0
+    start = {".png": b"\x89PNG", ".svg": b"<?xml"}[suffix]
+    assert first.startswith(start)
+    assert _history(cell_file, "--plot", out, *arguments) == 0
     assert out.read_bytes() == first
 
 
@@ -638,13 +707,13 @@ def test_the_picture_is_drawn_the_same_each_time(
 def test_a_picture_has_its_kind_and_replaces_only_its_like(cell_file: Path) -> None:
     _filled(cell_file, 1, lambda _: FLAT)
     history_path = cell_file.parent / "history.pdf"
-    assert main(["history", str(cell_file), "--plot", str(history_path)]) == 2
+    assert _history(cell_file, "--plot", history_path) == 2
     notes = cell_file.parent / "notes.png"
     notes.write_text("my notes")
-    assert main(["history", str(cell_file), "--plot", str(notes)]) == 2
+    assert _history(cell_file, "--plot", notes) == 2
     assert notes.read_text() == "my notes"
-    none_folder = cell_file.parent / "none"
-    assert main(["history", str(cell_file), "--plot", str(none_folder / "history.png")]) == 1
+    in_no_folder = cell_file.parent / "none" / "history.png"
+    assert _history(cell_file, "--plot", in_no_folder) == 1
 
 
 def test_a_broken_audit_is_reported_by_its_first_line(
@@ -652,20 +721,18 @@ def test_a_broken_audit_is_reported_by_its_first_line(
 ) -> None:
     audit = _place(cell_file).audit
     for number in range(4):
-        append(
-            audit, AuditAction.PROPOSED, at=BEGIN, who="anna", subject="x", details={"k": number}
-        )
-    verify = ["history", str(cell_file), "--verify"]
-    assert main(verify) == 0
+        details = {"k": number}
+        append(audit, AuditAction.PROPOSED, at=BEGIN, who="anna", subject="x", details=details)
+    assert _history(cell_file, "--verify") == 0
     assert "4 entries, chain unbroken" in capsys.readouterr().out
     changed_content = audit.read_bytes().replace(b'"k":2', b'"k":7')
     audit.write_bytes(changed_content)
-    assert main(verify) == 4
+    assert _history(cell_file, "--verify") == 4
     shown = capsys.readouterr()
     assert "line 3" in shown.err
     assert "BROKEN" in shown.out
     assert "keep this file" in shown.err
-    assert main([*verify, "--json"]) == 4
+    assert _history(cell_file, "--verify", "--json") == 4
     document = json.loads(capsys.readouterr().out)
     assert document["audit"]["broken_line"] == 3
 
@@ -675,14 +742,16 @@ def test_an_audit_whose_end_was_cut_off_is_noticed(
 ) -> None:
     """A chain cannot show that by itself: the note beside it knows its last entry."""
     place = _place(cell_file)
-    entries = [
-        append(place.audit, AuditAction.APPLIED, at=BEGIN, who="anna", subject="x", details={})
-        for _ in range(3)
-    ]
-    assert main(["history", str(cell_file), "--verify"]) == 0
-    lines = place.audit.read_bytes().splitlines(keepends=True)
-    place.audit.write_bytes(b"".join(lines[:2]))
-    assert main(["history", str(cell_file), "--verify"]) == 4
+    audit = place.audit
+    entries = []
+    for _ in range(3):
+        entry = append(audit, AuditAction.APPLIED, at=BEGIN, who="anna", subject="x", details={})
+        entries.append(entry)
+    assert _history(cell_file, "--verify") == 0
+    lines = audit.read_bytes().splitlines(keepends=True)
+    without_end = b"".join(lines[:2])
+    audit.write_bytes(without_end)
+    assert _history(cell_file, "--verify") == 4
     sha256 = entries[2].sha256
     error_output = capsys.readouterr().err
     assert sha256[:12] in error_output
@@ -706,12 +775,12 @@ def test_an_audit_without_the_end_of_a_session_is_noticed(
     )
     basis = Basis(declared.name, declared.digest, "")
     session = begin(declared.recalibration.folder, basis, BEGIN)
-    assert main(["history", str(cell_file), "--verify"]) == 0
+    assert _history(cell_file, "--verify") == 0
     state = session.state.with_(audit_sha256=ended.sha256)
     save_session(replace(session, state=state))
-    assert main(["history", str(cell_file), "--verify"]) == 0
+    assert _history(cell_file, "--verify") == 0
     _place(cell_file).audit.unlink()
-    assert main(["history", str(cell_file), "--verify"]) == 4
+    assert _history(cell_file, "--verify") == 4
     error_output = capsys.readouterr().err
     assert ended.sha256[:12] in error_output
 
@@ -724,11 +793,9 @@ def test_a_write_that_never_ended_is_reported_with_what_the_file_is(
 ) -> None:
     file = cell_file.parent / "controller.yaml"
     file.write_bytes(content)
-    digest = hashlib.sha256(b"old").hexdigest()
-    digests = {
-        "sha256_before": digest,
-        "sha256_after": hashlib.sha256(b"new").hexdigest(),
-    }
+    before = hashlib.sha256(b"old").hexdigest()
+    after = hashlib.sha256(b"new").hexdigest()
+    digests = {"sha256_before": before, "sha256_after": after}
     path = _place(cell_file).audit
     append(
         path,
@@ -738,9 +805,9 @@ def test_a_write_that_never_ended_is_reported_with_what_the_file_is(
         subject=str(file),
         details=digests,
     )
-    assert main(["history", str(cell_file), "--verify"]) == 0
+    assert _history(cell_file, "--verify") == 0
     printed = capsys.readouterr().out
-    assert says in " ".join(printed.split())
+    assert says in _one_spaced(printed)
 
 
 def _write_down(
@@ -748,18 +815,20 @@ def _write_down(
 ) -> AuditEntry:
     """A write to the cell's controller; the entry that ends it."""
     controller = str(load_cell(cell_file).controller_path)
+    ledger = ledger_of(cell_file)
     if back:
-        return write(ledger_of(cell_file), controller, "1" * 64, at=at)
-    return write(ledger_of(cell_file), controller, digest[::-1], digest=digest, at=at)
+        return write(ledger, controller, "1" * 64, at=at)
+    return write(ledger, controller, digest[::-1], digest=digest, at=at)
 
 
 def _verified(cell_file: Path, capsys: pytest.CaptureFixture[str]) -> str:
     """Return the findings of --verify in one line; empty where all is well."""
     capsys.readouterr()
-    code = main(["history", str(cell_file), "--verify"])
+    code = _history(cell_file, "--verify")
     error_output = capsys.readouterr().err
-    output = " ".join(error_output.split())
-    assert code == (4 if output else 0)
+    output = _one_spaced(error_output)
+    expected_code = 4 if output else 0
+    assert code == expected_code
     return output
 
 
@@ -783,28 +852,28 @@ def test_a_write_of_which_the_history_does_not_know_is_reported_and_entered_by_h
         details={"begun": 1},
     )
     reported = _verified(cell_file, capsys)
-    for part in (f"entry {first.number} of", "applied by anna", digest[:12], "--add"):
-        assert part in reported
-    assert main(["history", str(cell_file), "--verify", "--json"]) == 4
+    assert f"entry {first.number} of" in reported
+    assert "applied by anna" in reported
+    assert digest[:12] in reported
+    assert "--add" in reported
+    assert _history(cell_file, "--verify", "--json") == 4
     printed = capsys.readouterr().out
     found = json.loads(printed)["audit"]
-    assert [(one["number"], one["calibration_sha256"]) for one in found["unknown_writes"]] == [
-        (2, digest)
-    ]
-    assert main(["history", str(cell_file), "--add", str(file)]) == 0
+    (unknown,) = found["unknown_writes"]
+    assert unknown["number"] == 2
+    assert unknown["calibration_sha256"] == digest
+    assert _history(cell_file, "--add", file) == 0
     error_output = capsys.readouterr().err
     assert error_output.count("Entered too") == 1
     assert _verified(cell_file, capsys) == ""
     history = history_of(cell_file)
-    expected = [
-        (WriteAction.APPLIED, BEGIN, "anna", first.sha256),
-        (WriteAction.ROLLED_BACK, BEGIN, "anna", back.sha256),
-    ]
-    assert [
-        (event.action, event.at, event.who, event.audit) for event in history.events
-    ] == expected
+    applied_event, rollback_event = history.events
+    applied = (WriteAction.APPLIED, BEGIN, "anna", first.sha256)
+    rolled_back = (WriteAction.ROLLED_BACK, BEGIN, "anna", back.sha256)
+    assert _event_facts(applied_event) == applied
+    assert _event_facts(rollback_event) == rolled_back
     assert history.in_force() is None
-    assert main(["history", str(cell_file), "--add", str(file)]) == 0
+    assert _history(cell_file, "--add", file) == 0
     assert "Entered too" not in capsys.readouterr().err
 
 
@@ -821,7 +890,7 @@ def test_a_write_whose_calibration_is_added_later_is_in_its_place(
     reported = _verified(cell_file, capsys)
     assert f"entry {lost.number} of" in reported
     assert f"entry {known.number} of" not in reported
-    assert main(["history", str(cell_file), "--add", str(file)]) == 0
+    assert _history(cell_file, "--add", file) == 0
     error_output = capsys.readouterr().err
     assert error_output.count("Entered too") == 1
     assert _verified(cell_file, capsys) == ""
@@ -841,7 +910,7 @@ def test_nothing_is_entered_from_an_audit_that_someone_changed(
     changed_content = audit.read_bytes().replace(b'"who":"anna"', b'"who":"kim"')
     audit.write_bytes(changed_content)
     changed = audit.read_bytes()
-    assert main(["history", str(cell_file), "--add", str(file)]) == 3
+    assert _history(cell_file, "--add", file) == 3
     assert "Entered too" not in capsys.readouterr().err
     assert audit.read_bytes() == changed
     assert history_of(cell_file).events == ()
@@ -855,12 +924,15 @@ def test_drives_that_are_written_once_more_are_written_twice(
     """
     (digest,) = _filled(cell_file, 1, lambda _: FLAT)
     subject = drives_of("demo")
+    ledger = ledger_of(cell_file)
     for before in ("0" * 64, "1" * 64):
-        write(ledger_of(cell_file), subject, "1" * 64, digest=digest, before=before)
+        write(ledger, subject, "1" * 64, digest=digest, before=before)
     assert _verified(cell_file, capsys) == ""
     history = history_of(cell_file)
-    expected = [(subject, digest)] * 2
-    assert [(event.target, event.digest) for event in history.events] == expected
+    targets = [event.target for event in history.events]
+    digests = [event.digest for event in history.events]
+    assert targets == [subject] * 2
+    assert digests == [digest] * 2
     assert history.in_force(subject) == digest
 
 
@@ -874,8 +946,8 @@ def test_in_force_is_what_the_cell_s_own_controller_has(
         write(ledger_of(cell_file), target, digest[::-1], digest=digest)
 
     def found_in_force() -> str | None:
-        in_force = _json(capsys, str(cell_file))["in_force"]
-        return str(found) if (found := in_force) else None
+        in_force = _json(capsys, cell_file)["in_force"]
+        return str(in_force) if in_force else None
 
     applied(first, own)
     applied(second, "/another/controller.yaml")
@@ -890,11 +962,13 @@ def test_in_force_is_what_the_cell_s_own_controller_has(
     Path(own).write_text(edited + "# K.\n")
     assert found_in_force() == third  # the gains are the same
     capsys.readouterr()
-    assert main(["history", str(cell_file)]) == 0
+    assert _history(cell_file) == 0
     printed = capsys.readouterr().out
-    assert " ".join(printed.split()).count("in force") == 1
+    assert _one_spaced(printed).count("in force") == 1
     _put(cell_file, third)
-    Path(own).write_text(re.sub("gain: -9[.0-9]*", "gain: -9.5", Path(own).read_text()))
+    text = Path(own).read_text()
+    other_gain = re.sub("gain: -9[.0-9]*", "gain: -9.5", text)
+    Path(own).write_text(other_gain)
     assert found_in_force() is None
     Path(own).unlink()
     assert found_in_force() is None
@@ -904,37 +978,42 @@ def test_what_was_done_is_reported_in_the_words_of_who_did_it() -> None:
     def event(digest: str | None, action: WriteAction, who: str, target: str = "x") -> Event:
         return Event(digest, action, BEGIN, who, target)
 
-    entries = tuple(_entry(name) for name in ("a", "b", "c"))
+    entries = [_entry("a"), _entry("b"), _entry("c")]
+
     done = [event("a", WriteAction.APPLIED, "anna")]
     assert describe_actions(entries, done, "a") == {
         "a": "applied by anna, in force",
         "b": "-",
         "c": "-",
     }
-    done += [event("b", WriteAction.APPLIED, "ben"), event("c", WriteAction.APPLIED, "cem", "y")]
+
+    done.append(event("b", WriteAction.APPLIED, "ben"))
+    done.append(event("c", WriteAction.APPLIED, "cem", "y"))
     assert describe_actions(entries, done, "b") == {
         "a": "applied by anna",
         "b": "applied by ben, in force",
         "c": "applied by cem",
     }
-    done += [event("a", WriteAction.ROLLED_BACK, "dora")]
+
+    done.append(event("a", WriteAction.ROLLED_BACK, "dora"))
     assert describe_actions(entries, done, "a") == {
         "a": "gains restored by the rollback of dora, in force",
         "b": "applied by ben, rolled back by dora",
         "c": "applied by cem",
     }
-    done += [event(None, WriteAction.ROLLED_BACK, "eva", "y")]  # to numbers of no calibration
-    assert describe_actions(entries, done, None)["c"] == "applied by cem, rolled back by eva"
-    assert describe_actions(entries, done, "c")["c"] == (
-        "applied by cem, rolled back by eva, in force"
-    )
+
+    done.append(event(None, WriteAction.ROLLED_BACK, "eva", "y"))  # to numbers of no calibration
+    actions = describe_actions(entries, done, None)
+    assert actions["c"] == "applied by cem, rolled back by eva"
+    actions = describe_actions(entries, done, "c")
+    assert actions["c"] == "applied by cem, rolled back by eva, in force"
 
 
 def test_no_one_waits_for_a_pipe_or_reads_a_device_to_its_end(cell_file: Path) -> None:
-    os.mkfifo(cell_file.parent / "pipe")
-    pipe_folder = cell_file.parent / "pipe"
-    for path in (pipe_folder, Path("/dev/zero"), cell_file.parent):
-        assert main(["history", str(cell_file), "--add", str(path)]) == 4
+    pipe = cell_file.parent / "pipe"
+    os.mkfifo(pipe)
+    for path in (pipe, Path("/dev/zero"), cell_file.parent):
+        assert _history(cell_file, "--add", path) == 4
 
 
 @pytest.mark.parametrize("lost", ["removed", "truncated"])
@@ -944,14 +1023,14 @@ def test_a_lost_history_is_not_called_empty(
     calibration = calibration_of(0)
     file = cell_file.parent / "calibration.yaml"
     save_calibration(calibration, file)
-    assert main(["history", str(cell_file), "--add", str(file)]) == 0
+    assert _history(cell_file, "--add", file) == 0
     _write_down(cell_file, digest_of(calibration))
     kept = _place(cell_file).audit.read_bytes()
     _place(cell_file).audit.unlink()
     if lost == "truncated":
         _place(cell_file).audit.touch()
     capsys.readouterr()
-    assert main(["history", str(cell_file)]) == 0
+    assert _history(cell_file) == 0
     assert "--verify" in caplog.text
     assert "no calibration" not in capsys.readouterr().out
     # The next entry does not hide that there were others.
@@ -962,7 +1041,7 @@ def test_a_lost_history_is_not_called_empty(
     assert entered.sha256[:12] not in reported
     _place(cell_file).audit.write_bytes(kept)
     caplog.clear()
-    assert main(["history", str(cell_file)]) == 0
+    assert _history(cell_file) == 0
     events = history_of(cell_file).events
     assert [event.who for event in events] == ["anna"]
 
@@ -972,7 +1051,7 @@ def test_nothing_is_cut_off_in_80_columns(
 ) -> None:
     monkeypatch.setenv("COLUMNS", "80")
     _filled(cell_file, 3, lambda _: FLAT)
-    assert main(["history", str(cell_file)]) == 0
+    assert _history(cell_file) == 0
     shown = capsys.readouterr().out
     assert "nameplate" in shown
     assert "…" not in shown
@@ -982,8 +1061,8 @@ def test_an_audit_that_is_no_regular_file_is_broken(
     cell_file: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     audit = _place(cell_file).audit
-    pipe_folder = cell_file.parent / "pipe"
-    for target in (cell_file.parent, Path("/dev/null"), pipe_folder):
+    pipe = cell_file.parent / "pipe"
+    for target in (cell_file.parent, Path("/dev/null"), pipe):
         if not target.exists():
             os.mkfifo(target)
         audit.symlink_to(target)

@@ -79,15 +79,19 @@ def test_a_calibration_comes_back_as_it_was(ledger: Ledger) -> None:
     assert entry.gains == given_.gains
     expected = (digest, "demo", "ml", 14400)
     assert (entry.digest, entry.cell, entry.method, entry.rows) == expected
-    assert (entry.error_percent, entry.holdout_percent) == (3.2, 3.3)
-    assert entry.created == datetime(2025, 1, 2, 3, 4, 5, tzinfo=UTC)
+    assert entry.error_percent == 3.2
+    assert entry.holdout_percent == 3.3
+    created = datetime(2025, 1, 2, 3, 4, 5, tzinfo=UTC)
+    assert entry.created == created
     assert entry.entered == BEGIN
     assert not entry.applied
 
 
 def test_the_same_file_is_entered_once(ledger: Ledger) -> None:
-    digest = enter(ledger, calibration_of(0))
-    assert not enter_calibration(ledger, calibration_of(0), digest=digest, who="anna", at=BEGIN)
+    calibration = calibration_of(0)
+    digest = enter(ledger, calibration)
+    entered_again = enter_calibration(ledger, calibration, digest=digest, who="anna", at=BEGIN)
+    assert not entered_again
     assert len(read(ledger.audit)) == 1
     # Two processes at once may both find that it is not there.
     (entry,) = read(ledger.audit)
@@ -101,25 +105,21 @@ def test_the_same_file_is_entered_once(ledger: Ledger) -> None:
 def test_entries_are_in_the_order_in_which_they_were_fitted(ledger: Ledger) -> None:
     def enter_later(calibration: Calibration, days: int) -> None:
         at = BEGIN + timedelta(weeks=4, days=days)
-        enter_calibration(ledger, calibration, digest=digest_of(calibration), who="anna", at=at)
+        digest = digest_of(calibration)
+        enter_calibration(ledger, calibration, digest=digest, who="anna", at=at)
 
     for day, week in enumerate((3, 0, 2, 1)):
         enter_later(calibration_of(week), day)
     # Of another time zone, and at another spelling of it.
-    created = (BEGIN + timedelta(hours=1)).astimezone(timezone(-timedelta(hours=9))).isoformat()
-    late = replace(
-        calibration_of(0),
-        created=created,
-    )
+    hour_later = BEGIN + timedelta(hours=1)
+    zone = timezone(-timedelta(hours=9))
+    created = hour_later.astimezone(zone).isoformat()
+    late = replace(calibration_of(0), created=created)
     enter_later(late, 4)
     entries = read_history(ledger).entries
     found = [entry.created for entry in entries]
-    expected = [
-        BEGIN,
-        BEGIN + timedelta(hours=1),
-        *(BEGIN + timedelta(weeks=week) for week in (1, 2, 3)),
-    ]
-    assert found == expected
+    weeks_later = [BEGIN + timedelta(weeks=week) for week in (1, 2, 3)]
+    assert found == [BEGIN, hour_later, *weeks_later]
 
 
 def test_a_calibration_without_a_time_has_that_of_its_entry(ledger: Ledger) -> None:
@@ -134,7 +134,9 @@ def test_a_calibration_without_a_time_has_that_of_its_entry(ledger: Ledger) -> N
 def test_what_cannot_be_compared_is_refused(ledger: Ledger, different: str) -> None:
     known = calibration_of(0)
     changed_calibration = replace(calibration_of(1), cell="another")
-    gains = (*known.gains[:5], replace(known.gains[5], unit="Nm/A_peak"))
+    *others, last = known.gains
+    in_peak_amperes = replace(last, unit="Nm/A_peak")
+    gains = (*others, in_peak_amperes)
     axes = replace(calibration_of(1), gains=known.gains[:5])
     unit = replace(calibration_of(1), gains=gains)
     other = {
@@ -145,7 +147,9 @@ def test_what_cannot_be_compared_is_refused(ledger: Ledger, different: str) -> N
     enter(ledger, known)
     with pytest.raises(DataError) as refused:
         enter(ledger, other)
-    assert len(read(ledger.audit)) == len(read_history(ledger).entries) == 1
+    entries = read_history(ledger).entries
+    assert len(read(ledger.audit)) == 1
+    assert len(entries) == 1
     assert exit_code(DataError) == 4
     assert "it was not entered" in refused.value.remedy
 
@@ -153,9 +157,11 @@ def test_what_cannot_be_compared_is_refused(ledger: Ledger, different: str) -> N
 def test_the_first_calibration_has_the_axes_of_the_cell(ledger: Ledger) -> None:
     """Those of a history never change: with others, every right calibration would be refused."""
     known = calibration_of(0)
-    renamed = replace(known.gains[0], axis="A1")
+    first, *others = known.gains
+    renamed = replace(first, axis="A1")
+    of_other_axes = replace(known, gains=(renamed, *others))
     with pytest.raises(DataError) as refused:
-        enter(ledger, replace(known, gains=(renamed, *known.gains[1:])))
+        enter(ledger, of_other_axes)
     assert "the axes of the cell file" in refused.value.expected
     assert read_history(ledger).entries == ()
     enter(ledger, known)
@@ -165,11 +171,11 @@ def test_what_is_applied_and_rolled_back_is_reported(ledger: Ledger) -> None:
     first = enter(ledger, calibration_of(0))
     second = enter(ledger, calibration_of(1))
     reported = []
+    name_of = {None: "-", first: "first", second: "second"}
 
     def in_force() -> None:
-        reported.append(
-            {None: "-", first: "first", second: "second"}[read_history(ledger).in_force("x.yaml")]
-        )
+        digest = read_history(ledger).in_force("x.yaml")
+        reported.append(name_of[digest])
 
     write(ledger, "x.yaml", "1", digest=first)
     in_force()
@@ -236,10 +242,11 @@ def test_times_are_kept_in_utc_in_their_order(at: datetime) -> None:
 
 
 def test_a_time_without_its_zone_is_refused(ledger: Ledger) -> None:
+    calibration = calibration_of(0)
+    digest = "0" * 64
+    without_zone = datetime(2026, 1, 1)
     with pytest.raises(ValueError, match="zone"):
-        enter_calibration(
-            ledger, calibration_of(0), digest="0" * 64, who="anna", at=datetime(2026, 1, 1)
-        )
+        enter_calibration(ledger, calibration, digest=digest, who="anna", at=without_zone)
     assert read_history(ledger).entries == ()
 
 
@@ -282,10 +289,13 @@ def test_a_writer_killed_at_any_moment_leaves_a_whole_history(tmp_path: Path) ->
         history = read_history(ledger)
         assert len(history.entries) == week + 1
         for entry in history.entries:
-            assert [gain.axis for gain in entry.gains] == list(AXES)
+            axes = [gain.axis for gain in entry.gains]
+            assert axes == list(AXES)
         # One may have been ended whose writer did not live to say so.
-        assert known <= written.value <= len(history.events) <= written.value + 1
-        written.value = known = len(history.events)
+        event_count = len(history.events)
+        assert known <= written.value <= event_count <= written.value + 1
+        written.value = event_count
+        known = event_count
 
 
 def _add_many(folder: Path, weeks: range) -> None:
@@ -295,14 +305,16 @@ def _add_many(folder: Path, weeks: range) -> None:
 
 @pytest.mark.slow
 def test_two_processes_at_once_lose_nothing(tmp_path: Path) -> None:
-    writers = [
-        FORK.Process(target=_add_many, args=(tmp_path, range(first, 30))) for first in (0, 10, 20)
-    ]
+    writers = []
+    for first in (0, 10, 20):
+        weeks = range(first, 30)
+        writers.append(FORK.Process(target=_add_many, args=(tmp_path, weeks)))
     for writer in writers:
         writer.start()
     for writer in writers:
         writer.join()
-    assert [writer.exitcode for writer in writers] == [0, 0, 0]
+    exit_codes = [writer.exitcode for writer in writers]
+    assert exit_codes == [0, 0, 0]
     ledger = ledger_in(tmp_path)
     assert verify(ledger.audit).holds
     assert len(read_history(ledger).entries) == 30
@@ -345,7 +357,8 @@ def test_a_folder_that_is_not_there_is_reported(tmp_path: Path) -> None:
 
 
 def test_a_folder_may_have_any_name(tmp_path: Path) -> None:
-    folder = Path(os.fsdecode(os.fsencode(tmp_path) + b"/b\xff ?#%"))
+    name = os.fsdecode(b"b\xff ?#%")
+    folder = tmp_path / name
     folder.mkdir()
     digest = enter(ledger_in(folder), calibration_of(0))
     entries = read_history(ledger_in(folder)).entries
@@ -380,7 +393,9 @@ def test_a_write_of_a_killed_process_is_entered_by_the_next_one(cell_file: Path)
     for _ in range(2):
         enter(ledger, calibration_of(0))
         events = history_of(cell_file).events
-        assert [(event.who, event.at) for event in events] == [("anna", BEGIN)]
+        (event,) = events
+        assert event.who == "anna"
+        assert event.at == BEGIN
         actions = [entry.action for entry in read(ledger.audit)]
         assert actions.count(AuditAction.WRITE_FOUND) == 1
     assert run_verb("history", cell_file, "--verify") == 0
@@ -433,17 +448,16 @@ def test_another_cell_of_the_same_audit_has_its_own(cell_file: Path) -> None:
     begun = append(
         ledger.audit, AuditAction.APPLY_BEGUN, at=BEGIN, who="ben", subject=subject, details=details
     )
-    for action, more in (
-        (AuditAction.APPLIED, {"begun": begun.number}),
-        (
-            AuditAction.CALIBRATION_ENTERED,
-            {"cell": "another", "sha256": "2" * 64, "entered": "x", "document": "y"},
-        ),
-        (
-            AuditAction.ACKNOWLEDGED,
-            {"cell": "another", "axis": "J4", "since": BEGIN.isoformat(), "why": "z"},
-        ),
-    ):
+    applied = {"begun": begun.number}
+    entered = {"cell": "another", "sha256": "2" * 64, "entered": "x", "document": "y"}
+    since = BEGIN.isoformat()
+    acknowledged = {"cell": "another", "axis": "J4", "since": since, "why": "z"}
+    details_of_action: dict[AuditAction, dict[str, Any]] = {
+        AuditAction.APPLIED: applied,
+        AuditAction.CALIBRATION_ENTERED: entered,
+        AuditAction.ACKNOWLEDGED: acknowledged,
+    }
+    for action, more in details_of_action.items():
         append(ledger.audit, action, at=BEGIN, who="ben", subject=subject, details=more)
     assert history_of(cell_file) == before
 
@@ -485,28 +499,31 @@ def test_a_damaged_log_is_reported_by_each_command_that_reads_or_adds_to_it(
     """A calibration that is missing changes the judgement of a gain and of its drift."""
     for factor in (1.0, 1.02, 1.01):
         calibration_text = str(calibration_for(cell_file, factor))
-        assert main(["apply", str(cell_file), calibration_text, "--yes"]) == ExitCode.OK
+        code = main(["apply", str(cell_file), calibration_text, "--yes"])
+        assert code == ExitCode.OK
     ledger = ledger_of(cell_file)
     assert not read_history(ledger).may_lack
     lines = ledger.audit.read_bytes().splitlines(keepends=True)
     changed_line = lines[0].replace(b"demo", b"dema", 1)
+    without_first = lines[1:]
     damaged = {
-        "edited": [changed_line, *lines[1:]],
-        "first removed": lines[1:],
+        "edited": [changed_line, *without_first],
+        "first removed": without_first,
         "end cut off": lines[:-1],
         "deleted": [],
     }
-    ledger.audit.write_bytes(b"".join(damaged[damage]))
+    content = b"".join(damaged[damage])
+    ledger.audit.write_bytes(content)
     if damage == "deleted":
         ledger.audit.unlink()
     assert read_history(ledger).may_lack
     assert verify_ledger(ledger).history.may_lack
     calibration = str(calibration_for(cell_file, 1.005))
-    for command in (
-        ["apply", str(cell_file), calibration],
-        ["history", str(cell_file)],
-        ["rollback", str(cell_file)],
-    ):
+    cell = str(cell_file)
+    apply = ["apply", cell, calibration]
+    history = ["history", cell]
+    rollback = ["rollback", cell]
+    for command in (apply, history, rollback):
         caplog.clear()
         assert main(command) == ExitCode.OK
         assert MAY_LACK in caplog.text
@@ -585,7 +602,8 @@ def test_an_entry_that_cannot_be_noted_is_said_once_by_each_verb(
     with _note_that_cannot_be_written(note, kind):
         for verb in verbs:
             _write_as_shown(verb, capsys, caplog)
-            assert caplog.text.count(f"cannot be noted in {note}") == 1, verb[0]
+            count = caplog.text.count(f"cannot be noted in {note}")
+            assert count == 1, verb[0]
             assert remedy in caplog.text
         capsys.readouterr()
         assert run_verb("history", cell_file, "--verify") == ExitCode.OK
@@ -614,6 +632,7 @@ def test_a_path_that_is_not_utf_8_is_in_the_history(
     assert targets == [other, subject]
     assert history.in_force(other) == first
     assert run_verb("history", cell_file, "--verify") == 0
-    for arguments in (["--axis", "J4"], ["--json"], ["--csv", str(cell_file.with_suffix(".csv"))]):
+    table = str(cell_file.with_suffix(".csv"))
+    for arguments in (["--axis", "J4"], ["--json"], ["--csv", table]):
         assert run_verb("history", cell_file, *arguments) == 0
     assert "ctl\udcff" not in capsys.readouterr().out

@@ -33,9 +33,8 @@ from daq.log.csv_table import read_csv
 from daq.log.table import Table
 
 COUNT = 12
-VALUES = np.column_stack(
-    (0.01 * np.arange(COUNT), np.sin(np.arange(COUNT)), np.cos(np.arange(COUNT)))
-)
+NUMBER = np.arange(COUNT)
+VALUES = np.column_stack((0.01 * NUMBER, np.sin(NUMBER), np.cos(NUMBER)))
 ROWS = ["{:.6f},{:.6f},{:.6f}".format(*row) for row in VALUES.tolist()]
 READ = np.round(VALUES, 6)[:, 1:]
 
@@ -63,10 +62,13 @@ def _read(
     else:
         timed = TimeColumn(file="run.csv", column=stamps, unit=time)
     moved = None
+    side = Side.JOINT
     if velocity is not None:
-        moved = VelocityColumns(file="run.csv", columns=("v",), unit=velocity, side=Side.JOINT)
-    position = PositionColumns(file="run.csv", columns=columns[:1], unit=unit, side=Side.JOINT)
-    current = CurrentColumns(file="run.csv", columns=columns[1:], unit="A", factor=factor)
+        moved = VelocityColumns(file="run.csv", columns=("v",), unit=velocity, side=side)
+    of_position = columns[:1]
+    of_current = columns[1:]
+    position = PositionColumns(file="run.csv", columns=of_position, unit=unit, side=side)
+    current = CurrentColumns(file="run.csv", columns=of_current, unit="A", factor=factor)
     table = CsvLayout(**layout)
     rate_hz = None if time is not None else 100.0
     wanted = ImportDescription(
@@ -83,6 +85,13 @@ def _read(
     return read_csv(path, wanted, columns, timed)
 
 
+def _with_line(line: str, place: int) -> list[str]:
+    """The rows with another line among them."""
+    lines = list(ROWS)
+    lines.insert(place, line)
+    return lines
+
+
 @pytest.mark.parametrize(
     "units", ["s,rad,A", "[s],[rad],[A]", "(s), (rad), (A)", "sec,rad,", "s,m,A"]
 )
@@ -92,7 +101,8 @@ def test_a_line_of_units_below_the_header_is_no_row(tmp_path: Path, units: str) 
     lines = ["t,q,i", units, *ROWS]
     table = _read(tmp_path, lines)
     np.testing.assert_array_equal(table.values, READ)
-    assert table.place(0, "q") == f"{tmp_path}/run.csv:3, column q"
+    place = table.place(0, "q")
+    assert place == f"{tmp_path}/run.csv:3, column q"
     expected = (f"run.csv: line 2 was taken for the units of the columns: {units!r}",)
     assert table.remarks == expected
 
@@ -167,20 +177,23 @@ def test_a_unit_in_a_name_must_be_that_of_the_line_of_units(tmp_path: Path) -> N
         _read(tmp_path, lines, columns=columns)
     # Letters that may be no unit, and units that say the same.
     columns = ("q [A]", "i [Arms]")
-    assert (
-        len(_read(tmp_path, ["t,q [A],i [Arms]", "s,rad,A", *ROWS], columns=columns).values)
-        == COUNT
-    )
+    lines = ["t,q [A],i [Arms]", "s,rad,A", *ROWS]
+    table = _read(tmp_path, lines, columns=columns)
+    assert len(table.values) == COUNT
 
 
 def test_lines_count_as_an_editor_counts_them(tmp_path: Path) -> None:
     """A form feed and a line separator of Unicode end no line."""
-    lines = ["exported\x0cby\u2028hand", "t,q,i", "s,rad,A", *ROWS, "0.2,word,1.0", *ROWS[:1]]
-    pattern = rf"run\.csv:{4 + COUNT}, column q: found 'word'"
+    note = "exported\x0cby\u2028hand"
+    lines = [note, "t,q,i", "s,rad,A", *ROWS, "0.2,word,1.0", ROWS[0]]
+    line = 4 + COUNT
+    pattern = rf"run\.csv:{line}, column q: found 'word'"
     with pytest.raises(TableUnfit, match=pattern):
         _read(tmp_path, lines, skip_rows=1)
+
+    lines = [note, "t,q,i", "s,deg,A", *ROWS]
     with pytest.raises(TableUnfit, match=r"run\.csv:3, column q: found unit 'deg'"):
-        _read(tmp_path, [*lines[:2], "s,deg,A", *ROWS], skip_rows=1)
+        _read(tmp_path, lines, skip_rows=1)
 
 
 def test_a_header_of_numbers_is_named_by_its_line_where_units_follow(tmp_path: Path) -> None:
@@ -207,7 +220,8 @@ def test_velocities_in_another_unit_are_refused(tmp_path: Path, unit: str) -> No
 def test_letters_in_a_name_that_may_be_no_unit_say_nothing(tmp_path: Path) -> None:
     names = ("q [A]", "i [N]")
     lines = ["t,q [A],i [N]", *ROWS]
-    assert len(_read(tmp_path, lines, columns=names).values) == COUNT
+    table = _read(tmp_path, lines, columns=names)
+    assert len(table.values) == COUNT
 
 
 @pytest.mark.parametrize(
@@ -215,12 +229,14 @@ def test_letters_in_a_name_that_may_be_no_unit_say_nothing(tmp_path: Path) -> No
 )
 def test_a_factor_may_convert_another_quantity(tmp_path: Path, units: str, factor: float) -> None:
     lines = ["t,q,i", units, *ROWS]
-    assert len(_read(tmp_path, lines, factor=factor).values) == COUNT
+    table = _read(tmp_path, lines, factor=factor)
+    assert len(table.values) == COUNT
 
 
 def test_a_unit_that_is_not_known_says_nothing(tmp_path: Path) -> None:
     lines = ["t,q,i", "s,turns,A", *ROWS]
-    assert len(_read(tmp_path, lines).values) == COUNT
+    table = _read(tmp_path, lines)
+    assert len(table.values) == COUNT
 
 
 def test_a_row_that_is_commented_out_is_missing_at_a_rate(tmp_path: Path) -> None:
@@ -229,9 +245,13 @@ def test_a_row_that_is_commented_out_is_missing_at_a_rate(tmp_path: Path) -> Non
     with pytest.raises(TableUnfit, match=r"run\.csv:6") as caught:
         _read(tmp_path, lines, time=None, comment="#")
     assert "commented out" in caught.value.found
-    assert len(_read(tmp_path, lines, comment="#").values) == COUNT - 1
+
+    table = _read(tmp_path, lines, comment="#")
+    assert len(table.values) == COUNT - 1
+
     lines[5] = "# 12 rows"
-    assert len(_read(tmp_path, lines, time=None, comment="#").values) == COUNT - 1
+    table = _read(tmp_path, lines, time=None, comment="#")
+    assert len(table.values) == COUNT - 1
 
 
 def test_a_column_that_is_no_time_names_those_that_grow(tmp_path: Path) -> None:
@@ -245,8 +265,12 @@ def test_a_column_that_is_no_time_names_those_that_grow(tmp_path: Path) -> None:
 
 def test_a_factor_explains_another_unit_of_the_current(tmp_path: Path) -> None:
     lines = ["t,q,i", "s,rad,mA", *ROWS]
-    assert len(_read(tmp_path, lines, factor=0.001).values) == COUNT
-    assert len(_read(tmp_path, ["t,q,i", "s,mm,A", *ROWS], unit=PositionUnit.DEG).values) == COUNT
+    table = _read(tmp_path, lines, factor=0.001)
+    assert len(table.values) == COUNT
+
+    lines = ["t,q,i", "s,mm,A", *ROWS]
+    table = _read(tmp_path, lines, unit=PositionUnit.DEG)
+    assert len(table.values) == COUNT
 
 
 @pytest.mark.parametrize("line", ["Time,Position,Current", "nan,nan,nan", "s,n/a,A", "-,-,-"])
@@ -255,15 +279,16 @@ def test_a_line_of_other_words_is_refused_with_the_setting(tmp_path: Path, line:
     with pytest.raises(TableUnfit, match=r"run\.csv:2"):
         _read(tmp_path, lines)
     keep = KeptPart(from_row=2)
-    kept = _read(tmp_path, ["t,q,i", line, *ROWS], keep=keep)
-    np.testing.assert_array_equal(kept.values, READ)
+    table = _read(tmp_path, lines, keep=keep)
+    np.testing.assert_array_equal(table.values, READ)
 
 
 def test_the_advice_for_a_second_header_is_the_setting_that_reads_it(tmp_path: Path) -> None:
     lines = ["t,q,i", "Time,Position,Current", *ROWS]
     with pytest.raises(TableUnfit, match=r"`keep: \{from_row: 2\}`"):
         _read(tmp_path, lines)
-    again = ["t,q,i", *ROWS[:5], "Time,Position,Current", *ROWS[5:]]
+
+    again = ["t,q,i", *_with_line("Time,Position,Current", 5)]
     keep = KeptPart(from_row=6)
     with pytest.raises(TableUnfit, match=r"`keep: \{from_row: 7\}`"):
         _read(tmp_path, again, keep=keep)
@@ -274,39 +299,36 @@ def test_the_advice_for_a_second_header_is_the_setting_that_reads_it(tmp_path: P
 
 @pytest.mark.parametrize("sign", ["#", "%", "//"])
 def test_comments_before_and_after_the_rows_are_left_out(tmp_path: Path, sign: str) -> None:
-    lines = [
-        f"{sign} trace of a drive",
-        "",
-        "t,q,i",
-        f"{sign} 100 Hz",
-        *ROWS,
-        "",
-        f"{sign} {COUNT} samples",
-        "",
-    ]
+    title = f"{sign} trace of a drive"
+    rate = f"{sign} 100 Hz"
+    count = f"{sign} {COUNT} samples"
+    lines = [title, "", "t,q,i", rate, *ROWS, "", count, ""]
     table = _read(tmp_path, lines)
     np.testing.assert_array_equal(table.values, READ)
-    expected = (f"run.csv: left out after the rows: 1 line, '{sign} {COUNT} samples'",)
-    assert table.remarks == expected
+    (remark,) = table.remarks
+    assert remark == f"run.csv: left out after the rows: 1 line, '{count}'"
 
 
 @pytest.mark.parametrize("header", ["# t,q,i", "% t,q,i", "#t,q,i"])
 @pytest.mark.parametrize("comments", [[], ["# a note, about i"]])
 def test_a_header_may_begin_as_a_comment(tmp_path: Path, header: str, comments: list[str]) -> None:
     lines = [*comments, header, *ROWS]
-    np.testing.assert_array_equal(_read(tmp_path, lines).values, READ)
-    actual = _read(tmp_path, [*comments, header, *ROWS], time=None, columns=(2, 3)).values
-    np.testing.assert_array_equal(actual, READ)
+    by_name = _read(tmp_path, lines)
+    np.testing.assert_array_equal(by_name.values, READ)
+    by_number = _read(tmp_path, lines, time=None, columns=(2, 3))
+    np.testing.assert_array_equal(by_number.values, READ)
 
 
 def test_a_name_with_the_sign_of_a_comment_is_still_a_name(tmp_path: Path) -> None:
     lines = ["t,#q,i", *ROWS]
-    actual = _read(tmp_path, lines, columns=("#q", "i")).values
-    np.testing.assert_array_equal(actual, READ)
+    columns = ("#q", "i")
+    table = _read(tmp_path, lines, columns=columns)
+    np.testing.assert_array_equal(table.values, READ)
+
     lines = ["#q,t,i", *ROWS]
-    table = _read(tmp_path, lines, columns=("#q", "i"), time=None)
-    expected = np.round(VALUES[:, 0], 6)
-    np.testing.assert_array_equal(table.values[:, 0], expected)
+    table = _read(tmp_path, lines, columns=columns, time=None)
+    first = np.round(VALUES[:, 0], 6)
+    np.testing.assert_array_equal(table.values[:, 0], first)
 
 
 @pytest.mark.parametrize(
@@ -327,7 +349,7 @@ def test_a_name_with_the_sign_of_a_comment_is_still_a_name(tmp_path: Path) -> No
     ],
 )
 def test_a_line_among_the_rows_that_is_none_is_named(tmp_path: Path, line: str, place: int) -> None:
-    lines = ["t,q,i", *ROWS[:place], line, *ROWS[place:]]
+    lines = ["t,q,i", *_with_line(line, place)]
     pattern = (
         rf"run\.csv:{place + 2}: found .*a line that is no row "
         r"of numbers"
@@ -343,8 +365,10 @@ def test_a_line_among_the_rows_that_is_none_is_named(tmp_path: Path, line: str, 
     keep = KeptPart(to_row=place)
     before = _read(tmp_path, lines, keep=keep)
     np.testing.assert_array_equal(before.values, READ[:place])
+
     word, _, _ = line.partition(" ")
-    sign = word[:4] if word[:1].isalpha() else word
+    begins_with_letter = word[:1].isalpha()
+    sign = word[:4] if begins_with_letter else word
     assert f"`comment: {sign!r}`" in caught.value.remedy
     table = _read(tmp_path, lines, comment=sign)
     np.testing.assert_array_equal(table.values, READ)
@@ -360,10 +384,11 @@ def test_a_comment_that_may_be_a_number_is_refused(sign: str) -> None:
 
 
 def test_empty_lines_are_left_out_where_stamps_show_that_nothing_is_missing(tmp_path: Path) -> None:
-    lines = ["t,q,i", *ROWS[:5], "", *ROWS[5:]]
+    lines = ["t,q,i", *_with_line("", 5)]
     table = _read(tmp_path, lines)
     np.testing.assert_array_equal(table.values, READ)
-    assert table.place(5, "q") == f"{tmp_path}/run.csv:8, column q"
+    place = table.place(5, "q")
+    assert place == f"{tmp_path}/run.csv:8, column q"
     with pytest.raises(TableUnfit, match=r"run\.csv:7: found an empty line"):
         _read(tmp_path, lines, time=None)
 
@@ -372,26 +397,29 @@ def test_line_ends_that_were_doubled_make_no_rows(tmp_path: Path) -> None:
     doubled: list[str] = []
     for row in ("t,q,i", *ROWS):
         doubled += [row, ""]
-    actual = _read(tmp_path, doubled, time=None).values
-    np.testing.assert_array_equal(actual, READ)
+    table = _read(tmp_path, doubled, time=None)
+    np.testing.assert_array_equal(table.values, READ)
 
 
 @pytest.mark.parametrize("line", ["sep=,", '"sep=,"', "SEP=,"])
 def test_the_line_that_names_the_delimiter_is_no_header(tmp_path: Path, line: str) -> None:
     lines = [line, "t,q,i", *ROWS]
-    np.testing.assert_array_equal(_read(tmp_path, lines).values, READ)
+    table = _read(tmp_path, lines)
+    np.testing.assert_array_equal(table.values, READ)
 
 
 def test_another_delimiter_than_the_files_own_is_refused(tmp_path: Path) -> None:
-    lines = ["sep=;", "t;q;i", *(row.replace(",", ";") for row in ROWS)]
+    rows = [row.replace(",", ";") for row in ROWS]
+    lines = ["sep=;", "t;q;i", *rows]
     with pytest.raises(TableUnfit, match=r"run\.csv:1: found `sep=;`.*write `delimiter: ';'`"):
         _read(tmp_path, lines)
-    actual = _read(tmp_path, lines, delimiter=";").values
-    np.testing.assert_array_equal(actual, READ)
+    table = _read(tmp_path, lines, delimiter=";")
+    np.testing.assert_array_equal(table.values, READ)
 
 
 def test_the_minus_sign_of_typography_is_read(tmp_path: Path) -> None:
-    lines = ["t,q,i", *(row.replace("-", "\u2212") for row in ROWS)]
+    rows = [row.replace("-", "\u2212") for row in ROWS]
+    lines = ["t,q,i", *rows]
     table = _read(tmp_path, lines)
     np.testing.assert_array_equal(table.values, READ)
     assert table.remarks == ("run.csv: the minus sign U+2212 was read as -",)
@@ -406,8 +434,8 @@ def test_a_last_line_that_was_cut_off_is_left_out_by_the_setting_that_is_named(
     with pytest.raises(TableUnfit, match=pattern):
         _read(tmp_path, lines, end="")
     keep = KeptPart(to_row=COUNT)
-    actual = _read(tmp_path, lines, end="", keep=keep).values
-    np.testing.assert_array_equal(actual, READ)
+    table = _read(tmp_path, lines, end="", keep=keep)
+    np.testing.assert_array_equal(table.values, READ)
 
 
 def test_two_recordings_in_one_file_are_parted_by_the_settings_that_are_named(
@@ -420,13 +448,14 @@ def test_two_recordings_in_one_file_are_parted_by_the_settings_that_are_named(
         r"once more",
     ) as caught:
         _read(tmp_path, lines)
-    assert f"{{to_row: {COUNT}}}" in caught.value.remedy
-    expected = f"{{from_row: {COUNT + 2}}}"
-    assert expected in caught.value.remedy
     from_row = COUNT + 2
-    for part in (KeptPart(to_row=COUNT), KeptPart(from_row=from_row)):
-        actual = _read(tmp_path, lines, keep=part).values
-        np.testing.assert_array_equal(actual, READ)
+    assert f"{{to_row: {COUNT}}}" in caught.value.remedy
+    assert f"{{from_row: {from_row}}}" in caught.value.remedy
+    first = KeptPart(to_row=COUNT)
+    second = KeptPart(from_row=from_row)
+    for part in (first, second):
+        table = _read(tmp_path, lines, keep=part)
+        np.testing.assert_array_equal(table.values, READ)
 
 
 def test_a_second_header_with_other_names_is_no_line_to_be_left_out(tmp_path: Path) -> None:
@@ -443,26 +472,27 @@ def test_a_second_header_with_other_names_is_no_line_to_be_left_out(tmp_path: Pa
 def test_rows_without_numbers_at_an_end_are_cut_by_the_setting_that_is_named(
     tmp_path: Path, first: int, last: int
 ) -> None:
-    rows = [
-        ROWS[row] if not first <= row <= last else f"{0.01 * row:.2f},nan,nan"
-        for row in range(COUNT)
-    ]
-    if first == 0:
-        setting = f"from_row: {last + 2}"
-    else:
-        setting = f"to_row: {first}"
-    pattern = rf"`keep: \{{{setting}\}}`"
-    with pytest.raises(TableUnfit, match=pattern):
-        _read(tmp_path, ["t,q,i", *rows])
+    rows = list(ROWS)
+    for row in range(first, last + 1):
+        time_s = 0.01 * row
+        rows[row] = f"{time_s:.2f},nan,nan"
+    lines = ["t,q,i", *rows]
     if first == 0:
         from_row = last + 2
+        setting = f"from_row: {from_row}"
         part = KeptPart(from_row=from_row)
+        numbers = READ[last + 1 :]
     else:
+        setting = f"to_row: {first}"
         part = KeptPart(to_row=first)
-    kept = READ[last + 1 :] if first == 0 else READ[:first]
-    lines = ["t,q,i", *rows]
-    actual = _read(tmp_path, lines, keep=part).values
-    np.testing.assert_array_equal(actual, kept)
+        numbers = READ[:first]
+
+    pattern = rf"`keep: \{{{setting}\}}`"
+    with pytest.raises(TableUnfit, match=pattern):
+        _read(tmp_path, lines)
+
+    table = _read(tmp_path, lines, keep=part)
+    np.testing.assert_array_equal(table.values, numbers)
 
 
 @pytest.mark.parametrize(
@@ -476,10 +506,12 @@ def test_times_are_kept(
     table = _read(tmp_path, lines, keep=keep)
     np.testing.assert_array_equal(table.values, READ[rows])
     assert table.stamps is not None
-    expected = round(1e9 * VALUES[rows][0, 0])
-    assert table.stamps.first_ns == expected
-    value_difference = VALUES[rows][-1, 0] - VALUES[rows][0, 0]
-    assert table.stamps.time_s[-1] == pytest.approx(value_difference)
+    times_s = VALUES[rows, 0]
+    first_s = times_s[0]
+    last_s = times_s[-1]
+    assert table.stamps.first_ns == round(1e9 * first_s)
+    duration_s = last_s - first_s
+    assert table.stamps.time_s[-1] == pytest.approx(duration_s)
 
 
 PIECES = (
@@ -497,7 +529,13 @@ PIECES = (
     "1e999,0,0",
     "\t",
 )
-PARTS = (None, KeptPart(from_row=2), KeptPart(to_row=3), KeptPart(from_s=0.01), KeptPart(to_s=0.02))
+PARTS = (
+    None,
+    KeptPart(from_row=2),
+    KeptPart(to_row=3),
+    KeptPart(from_s=0.01),
+    KeptPart(to_s=0.02),
+)
 
 
 @pytest.mark.slow
@@ -519,8 +557,9 @@ def test_any_lines_are_read_or_refused(
 ) -> None:
     """Numbers that are read are finite, and each stamp has its row."""
     folder = tmp_path_factory.getbasetemp()
+    with_header = ["t,q,i", *lines]
     try:
-        table = _read(folder, ["t,q,i", *lines], time=time, keep=part, comment=comment)
+        table = _read(folder, with_header, time=time, keep=part, comment=comment)
     except TableUnfit:
         return
     assert np.isfinite(table.values).all()
@@ -551,13 +590,17 @@ def test_a_header_with_another_delimiter_names_the_setting_that_reads_it(
     tmp_path: Path, delimiter: str, as_yaml: str
 ) -> None:
     """The advice was to correct the columns."""
-    lines = [delimiter.join(line) for line in (("t", "q", "i"), ("0", "1", "2"), ("1", "2", "3"))]
+    with_commas = ["t,q,i", "0,1,2", "1,2,3", "2,3,4"]
+    lines = [line.replace(",", delimiter) for line in with_commas]
     with pytest.raises(TableUnfit) as refused:
-        _read(tmp_path, lines)
-    assert refused.value.remedy.startswith(f"write `delimiter: {as_yaml}` under `table`")
-    layout = parse_yaml(f"delimiter: {as_yaml}".encode(), "layout").tree
-    table = _read(tmp_path, [*lines, delimiter.join(("2", "3", "4"))], **layout)
-    assert table.values[:, 0].tolist() == [1.0, 2.0, 3.0]
+        _read(tmp_path, lines[:3])
+    setting = f"delimiter: {as_yaml}"
+    assert refused.value.remedy.startswith(f"write `{setting}` under `table`")
+
+    layout = parse_yaml(setting.encode(), "layout").tree
+    table = _read(tmp_path, lines, **layout)
+    positions = table.values[:, 0]
+    assert positions.tolist() == [1.0, 2.0, 3.0]
 
 
 def test_a_file_without_rows_shows_the_line_that_was_taken_for_the_header(tmp_path: Path) -> None:
@@ -568,33 +611,40 @@ def test_a_file_without_rows_shows_the_line_that_was_taken_for_the_header(tmp_pa
 def test_a_tail_of_nul_is_a_loss_of_power_and_names_the_cut(tmp_path: Path) -> None:
     """The advice was to save the file as UTF-8."""
     lines = ["t,q,i", "0,1,2", "1,2,3", "2,3,4"]
+    end = "\n" + "\0" * 512
     with pytest.raises(TableUnfit) as refused:
-        _read(tmp_path, lines, end="\n" + "\0" * 512)
-    length = len("\n".join(lines)) + 1
+        _read(tmp_path, lines, end=end)
+    text = "\n".join(lines)
+    length = len(text) + 1
     assert refused.value.found == f"nothing but NUL from byte {length} to the end"
     assert f"head -c {length}" in refused.value.remedy
-    kept = (tmp_path / "run.csv").read_bytes()[:length].decode()
-    table = _read(tmp_path, kept.splitlines())
+    content = (tmp_path / "run.csv").read_bytes()
+    head = content[:length].decode()
+    table = _read(tmp_path, head.splitlines())
     assert len(table.values) == 3
 
 
 def test_a_packed_file_is_no_text_in_another_encoding(tmp_path: Path) -> None:
     packed = gzip.compress(b"t,q,i\n0,1,2\n1,2,3\n2,3,4\n")
-    (tmp_path / "packed").write_bytes(packed)
+    path = tmp_path / "packed"
+    path.write_bytes(packed)
+    unit = PositionUnit.RAD
+    position = PositionColumns(file="packed", columns=("q",), unit=unit, side=Side.JOINT)
+    current = CurrentColumns(file="packed", columns=("i",), unit="A")
     wanted = ImportDescription(
         name="run",
         cell="cell.yaml",
-        position=PositionColumns(
-            file="packed", columns=("q",), unit=PositionUnit.RAD, side=Side.JOINT
-        ),
-        current=CurrentColumns(file="packed", columns=("i",), unit="A"),
+        position=position,
+        current=current,
         rate_hz=100.0,
     )
     with pytest.raises(TableUnfit, match=r"packed by gzip.*gunzip"):
-        read_csv(tmp_path / "packed", wanted, ("q", "i"), None)
+        read_csv(path, wanted, ("q", "i"), None)
 
 
 def test_a_long_field_is_cut_in_the_message(tmp_path: Path) -> None:
+    long_field = "x" * 5000
+    lines = ["t,q,i", "0,1,2", f"1,{long_field},3", "2,3,4"]
     with pytest.raises(TableUnfit) as refused:
-        _read(tmp_path, ["t,q,i", "0,1,2", "1," + "x" * 5000 + ",3", "2,3,4"])
+        _read(tmp_path, lines)
     assert len(refused.value.found) <= 60

@@ -26,8 +26,10 @@ from tests.daq.command_line import run_verb
 from tests.daq.logs import damaged
 
 ROWS = 300
-Q = 20.0 * np.sin(np.arange(ROWS)[:, None] / 40.0 + np.arange(6))
-CURRENT = np.cos(np.arange(ROWS)[:, None] / 7.0 + np.arange(6))
+ROW = np.arange(ROWS)[:, None]
+AXIS = np.arange(6)
+Q = 20.0 * np.sin(ROW / 40.0 + AXIS)
+CURRENT = np.cos(ROW / 7.0 + AXIS)
 WANTED = ImportDescription.model_construct()
 
 
@@ -38,40 +40,45 @@ def read(path: Path, *columns: str | int, time: TimeColumn | None = None) -> Tab
 
 @pytest.mark.parametrize("packed", [False, True], ids=("v6", "v7"))
 def test_matrices_vectors_and_fields_are_read(packed: bool, tmp_path: Path) -> None:
-    clock_ns = 1_700_000_000_123_456_789 + 4_000_000 * np.arange(ROWS, dtype=np.uint64)
+    cycle = np.arange(ROWS, dtype=np.uint64)
+    clock_ns = 1_700_000_000_123_456_789 + 4_000_000 * cycle
     seconds = np.arange(ROWS) * 4e-3
     current = CURRENT.T.astype(np.float32)
     counts = (1000.0 * Q).astype(np.int16)
     run = {"counts": counts, "t": clock_ns, "note": "bare"}
+    turned = np.asfortranarray(current)
     variables = {
         "q": Q,
-        "turned": np.asfortranarray(current),
+        "turned": turned,
         "t": seconds,
         "run": run,
     }
     path = tmp_path / "run.mat"
     savemat(path, variables, do_compression=packed)
     time = TimeColumn(file="run.mat", column="run.t", unit=TimeUnit.NANOSECOND)
+
     table = read(path, "q.1", "q.6", "turned.2", "run.counts.3", "t", time=time)
-    expected = (
-        Q[:, 0],
-        Q[:, 5],
-        CURRENT[:, 1].astype(np.float32),
-        (1000.0 * Q[:, 2]).astype(np.int16),
-        seconds,
-    )
-    np.testing.assert_array_equal(table.values, np.column_stack(expected))
+
+    first = Q[:, 0]
+    sixth = Q[:, 5]
+    second_current = current[1]
+    third_counts = counts[:, 2]
+    columns = np.column_stack((first, sixth, second_current, third_counts, seconds))
+    np.testing.assert_array_equal(table.values, columns)
     assert table.stamps is not None
-    clock_n = int(clock_ns[0])
-    assert table.stamps.first_ns == clock_n
-    np.testing.assert_allclose(table.stamps.time_s, np.arange(ROWS) * 4e-3, atol=1e-12)
+    first_ns = int(clock_ns[0])
+    assert table.stamps.first_ns == first_ns
+    np.testing.assert_allclose(table.stamps.time_s, seconds, atol=1e-12)
+
     time_column = TimeColumn(file="run.mat", column="t", unit=TimeUnit.SECOND)
     other = read(path, time=time_column)
     assert other.stamps is not None
     assert other.values.shape == (ROWS, 0)
     np.testing.assert_array_equal(other.stamps.time_s, seconds)
+
+    date_column = TimeColumn(file="run.mat", column="t", unit=TimeUnit.ISO_8601)
     with pytest.raises(TableUnfit, match="posixtime"):
-        read(path, time=TimeColumn(file="run.mat", column="t", unit=TimeUnit.ISO_8601))
+        read(path, time=date_column)
 
 
 @settings(deadline=None, max_examples=60, derandomize=True)
@@ -87,10 +94,14 @@ def test_any_matrix_comes_back(
 ) -> None:
     path = tmp_path_factory.getbasetemp() / "any.mat"
     savemat(path, {"q": values}, do_compression=packed)
-    rows = values if values.shape[0] >= values.shape[1] else values.T
-    columns = [f"q.{number}" for number in range(1, rows.shape[1] + 1)]
+    height, width = values.shape
+    rows = values if height >= width else values.T
+    count = min(height, width)
+    columns = [f"q.{number + 1}" for number in range(count)]
     if np.isfinite(values).all():
-        np.testing.assert_array_equal(read(path, *columns).values, rows.astype(np.float64))
+        table = read(path, *columns)
+        numbers = rows.astype(np.float64)
+        np.testing.assert_array_equal(table.values, numbers)
     else:
         with pytest.raises(
             TableUnfit,
@@ -130,10 +141,26 @@ def test_what_is_no_column_of_numbers_is_named(
     columns: tuple[str, ...], message: str, tmp_path: Path
 ) -> None:
     path = tmp_path / "run.mat"
-    many = np.zeros((1, 2), dtype=[("q", object)])
-    cell = np.array([1.0, "a"], dtype=object)
-    savemat(path, {"q": Q, "t": Q[:, 0], "run": {"q": Q}, "note": "text", "many": many, "z": 1j * Q, "cell": cell,  # noqa: E501
-                   "one": 1.0, "none": Q[:0], "block": np.ones((3, 4, 5)), "short": Q[1:, 0]})  # fmt: skip  # noqa: E501
+    first = Q[:, 0]
+    complex_numbers = 1j * Q
+    two_structs = np.zeros((1, 2), dtype=[("q", object)])
+    cell_array = np.array([1.0, "a"], dtype=object)
+    no_rows = Q[:0]
+    block = np.ones((3, 4, 5))
+    variables = {
+        "q": Q,
+        "t": first,
+        "run": {"q": Q},
+        "note": "text",
+        "many": two_structs,
+        "z": complex_numbers,
+        "cell": cell_array,
+        "one": 1.0,
+        "none": no_rows,
+        "block": block,
+        "short": first[1:],
+    }
+    savemat(path, variables)
     with pytest.raises(TableUnfit, match=message):
         read(path, *columns)
 
@@ -161,8 +188,30 @@ def test_files_of_other_formats_are_refused(content: bytes, message: str, tmp_pa
 
 
 def _element(kind: int, data: bytes) -> bytes:
-    packed = struct.pack("<II", kind, len(data))
-    return packed + data + bytes(-len(data) % 8)
+    tag = struct.pack("<II", kind, len(data))
+    padding = bytes(-len(data) % 8)
+    return tag + data + padding
+
+
+MATRIX = 14  #: types of elements of the format
+COMPRESSED = 15
+CELL_ARRAY = 1  #: classes of a matrix
+DOUBLE_ARRAY = 6
+OBJECT_ARRAY = 17
+
+
+def _class_element(array_class: int) -> bytes:
+    flags = struct.pack("<II", array_class, 0)
+    return _element(6, flags)
+
+
+def _size_element(rows: int, columns: int) -> bytes:
+    size = struct.pack("<2i", rows, columns)
+    return _element(5, size)
+
+
+def _text_element(text: bytes) -> bytes:
+    return _element(1, text)
 
 
 HEADER = b"MATLAB 5.0 MAT-file".ljust(124) + b"\0\1IM"
@@ -174,12 +223,13 @@ def test_cells_in_cells_are_not_followed(tmp_path: Path) -> None:
     size = 0
     heads = []
     for level in range(depth):
-        name = _element(1, b"q" if level == depth - 1 else b"")
-        packed = struct.pack("<II", 1, 0)
-        head = _element(6, packed) + _element(5, struct.pack("<2i", 1, 1)) + name
+        is_outermost = level == depth - 1
+        name = b"q" if is_outermost else b""
+        head = _class_element(CELL_ARRAY) + _size_element(1, 1) + _text_element(name)
         size += len(head)
-        heads.append(struct.pack("<II", 14, size) + head)
-        size += 8
+        tag = struct.pack("<II", MATRIX, size)
+        heads.append(tag + head)
+        size += len(tag)
     path = tmp_path / "deep.mat"
     content = HEADER + b"".join(reversed(heads))
     path.write_bytes(content)
@@ -189,10 +239,12 @@ def test_cells_in_cells_are_not_followed(tmp_path: Path) -> None:
 
 def test_an_object_is_named(tmp_path: Path) -> None:
     """MATLAB's table, timetable and timeseries have no dimensions and no numbers of their own."""
-    packed = struct.pack("<II", 17, 0)
-    body = _element(6, packed) + b"".join(_element(1, word) for word in (b"run", b"MCOS", b"table"))
+    body = _class_element(OBJECT_ARRAY)
+    for word in (b"run", b"MCOS", b"table"):
+        body += _text_element(word)
     path = tmp_path / "table.mat"
-    path.write_bytes(HEADER + _element(14, body))
+    matrix = _element(MATRIX, body)
+    path.write_bytes(HEADER + matrix)
     with pytest.raises(
         TableUnfit,
         match=r"run, an object \(a table, timetable, .*; expected "
@@ -202,15 +254,13 @@ def test_an_object_is_named(tmp_path: Path) -> None:
 
 
 def test_a_bomb_is_not_unpacked(tmp_path: Path) -> None:
-    head = (
-        _element(6, struct.pack("<II", 6, 0))
-        + _element(5, struct.pack("<2i", 2**27, 1))
-        + _element(1, b"q")
-    )
-    packed = zlib.compress(struct.pack("<II", 14, 2**30) + head + bytes(2**20))
+    head = _class_element(DOUBLE_ARRAY) + _size_element(2**27, 1) + _text_element(b"q")
+    tag = struct.pack("<II", MATRIX, 2**30)
+    zeros = bytes(2**20)
+    packed = zlib.compress(tag + head + zeros)
+    packed_tag = struct.pack("<II", COMPRESSED, len(packed))
     path = tmp_path / "bomb.mat"
-    content = HEADER + struct.pack("<II", 15, len(packed)) + packed
-    path.write_bytes(content)
+    path.write_bytes(HEADER + packed_tag + packed)
     with pytest.raises(TableUnfit, match=r"\d+ bytes that unfold to 1073741824"):
         read(path, "q.1")
 
@@ -223,9 +273,12 @@ def test_a_damaged_file_is_read_or_refused(
     """The format has no checksum: a flipped bit of a number passes, as in every reader of it."""
     rng = random.Random(seed)
     data = rng.choice(files)
-    at = rng.choice((rng.randrange(len(data)), rng.randrange(100, 400)))
+    anywhere = rng.randrange(len(data))
+    near_start = rng.randrange(100, 400)
+    at = rng.choice((anywhere, near_start))
     path = tmp_path_factory.getbasetemp() / "hurt.mat"
-    path.write_bytes(damaged(data, hurt, at, rng, junk_bytes=12))
+    content = damaged(data, hurt, at, rng, junk_bytes=12)
+    path.write_bytes(content)
     try:
         table = read(path, "run.q.1", "q.2")
     except TableUnfit as error:
@@ -237,52 +290,66 @@ def test_a_damaged_file_is_read_or_refused(
 @pytest.fixture(scope="module")
 def files(tmp_path_factory: pytest.TempPathFactory) -> tuple[bytes, bytes]:
     """A small file, not packed and packed."""
-    made = []
-    for packed in (False, True):
-        path = tmp_path_factory.mktemp("mat") / "run.mat"
-        run = {"q": Q[:20], "note": "x"}
-        savemat(path, {"run": run, "q": Q[:20]}, do_compression=packed)
-        made.append(path.read_bytes())
-    return made[0], made[1]
+    path = tmp_path_factory.mktemp("mat") / "run.mat"
+    q = Q[:20]
+    run = {"q": q, "note": "x"}
+    variables = {"run": run, "q": q}
+    savemat(path, variables, do_compression=False)
+    plain = path.read_bytes()
+    savemat(path, variables, do_compression=True)
+    packed = path.read_bytes()
+    return plain, packed
 
 
 def test_a_matrix_is_imported_with_its_columns_as_axes(checkout: Path, tmp_path: Path) -> None:
-    savemat(tmp_path / "run.mat", {"q": Q, "run": {"i": CURRENT, "t": np.arange(ROWS) * 1e-3}})
+    time_s = np.arange(ROWS) * 1e-3
+    recorded = {"i": CURRENT, "t": time_s}
+    savemat(tmp_path / "run.mat", {"q": Q, "run": recorded})
     description = tmp_path / "run.yaml"
     out = tmp_path / "log.mcap"
     position = {"file": "run.mat", "columns": ["q"], "unit": "deg", "side": "joint"}
     current = {"file": "run.mat", "columns": ["run.i"], "unit": "A"}
     cell = str(checkout / "configs/cells/demo.yaml")
+    time = {"file": "run.mat", "column": "run.t", "unit": "s"}
     document = {
         "name": "run",
         "cell": cell,
         "position": position,
         "current": current,
-        "time": {"file": "run.mat", "column": "run.t", "unit": "s"},
+        "time": time,
     }
     description.write_text(json.dumps(document))
-    assert run_verb("import", description, "--data", tmp_path, "--out", out) == 0
+
+    code = run_verb("import", description, "--data", tmp_path, "--out", out)
+
+    assert code == 0
     run, _ = load_run(out)
     assert run.rate_hz == pytest.approx(1000.0)
-    np.testing.assert_allclose(run.position_rad, np.radians(Q), atol=2e-9)
+    position_rad = np.radians(Q)
+    np.testing.assert_allclose(run.position_rad, position_rad, atol=2e-9)
     np.testing.assert_allclose(run.current_a, CURRENT, atol=1e-9)
 
 
 def test_stamps_and_numbers_of_columns_without_end_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "run.mat"
-    grid = np.linspace(0.0, 1e300, ROWS)
-    savemat(path, {"q": Q, "t": grid, "n": np.full(ROWS, 2**62)})
-    for column, unit in (("t", TimeUnit.SECOND), ("n", TimeUnit.MICROSECOND)):
-        time = TimeColumn(file="run.mat", column=column, unit=unit)
+    seconds = np.linspace(0.0, 1e300, ROWS)
+    microseconds = np.full(ROWS, 2**62)
+    savemat(path, {"q": Q, "t": seconds, "n": microseconds})
+    in_seconds = TimeColumn(file="run.mat", column="t", unit=TimeUnit.SECOND)
+    in_microseconds = TimeColumn(file="run.mat", column="n", unit=TimeUnit.MICROSECOND)
+    for time in (in_seconds, in_microseconds):
         with pytest.raises(TableUnfit, match="a stamp of"):
             read(path, "q.1", time=time)
+    long_number = 5000 * "1"
     with pytest.raises(TableUnfit, match=r"VARIABLE|no variable"):
-        read(path, "q." + 5000 * "1")
+        read(path, f"q.{long_number}")
 
 
 def test_a_column_under_two_names_is_one(tmp_path: Path) -> None:
     path = tmp_path / "run.mat"
-    savemat(path, {"q": Q[:, :1], "i": CURRENT[:, :1]})
+    position = Q[:, :1]
+    current = CURRENT[:, :1]
+    savemat(path, {"q": position, "i": current})
     with pytest.raises(TableUnfit, match=r"column q\.1 a second time"):
         read(path, "q", "i", "q.1")
 
@@ -299,33 +366,40 @@ def test_a_part_of_a_matrix_is_kept_by_rows_and_by_times(tmp_path: Path) -> None
     for part in (KeptPart(from_row=6), KeptPart(from_s=0.05)):
         wanted = ImportDescription.model_construct(keep=part)
         table = read_mat(path, wanted, ("q",), column)
-        actual = table.values[:, 0]
-        np.testing.assert_array_equal(actual, values[5:])
+        column_values = table.values[:, 0]
+        np.testing.assert_array_equal(column_values, values[5:])
         assert table.stamps is not None
         assert table.stamps.first_ns == 50_000_000
-        assert table.place(0, "q") == f"{path}, row 6, column q"
+        place = table.place(0, "q")
+        assert place == f"{path}, row 6, column q"
+
+
+def _read_with_time(path: Path, time: np.ndarray[Any, Any], unit: TimeUnit) -> Table:
+    """Six rows with these times in their unit."""
+    q = np.arange(6.0)
+    savemat(path, {"t": time, "q": q})
+    column = TimeColumn(file="run.mat", column="t", unit=unit)
+    return read(path, "q", time=column)
 
 
 @pytest.mark.parametrize("kind", [np.uint32, np.float64])
 def test_a_counter_of_time_that_wraps_goes_on(kind: type, tmp_path: Path) -> None:
     path = tmp_path / "run.mat"
-    counts = (2**32 - 20_000 + 10_000 * np.arange(6)) % 2**32
-    savemat(path, {"t": counts.astype(kind), "q": np.arange(6.0)})
-    column = TimeColumn(file="run.mat", column="t", unit=TimeUnit.MICROSECOND)
-    table = read_mat(path, ImportDescription.model_construct(), ("q",), column)
+    first_us = 2**32 - 20_000
+    counts = (first_us + 10_000 * np.arange(6)) % 2**32
+    table = _read_with_time(path, counts.astype(kind), TimeUnit.MICROSECOND)
     assert table.stamps is not None
-    expected = 0.01 * np.arange(6)
-    assert table.stamps.time_s == pytest.approx(expected, abs=1e-9)
+    expected_s = 0.01 * np.arange(6)
+    assert table.stamps.time_s == pytest.approx(expected_s, abs=1e-9)
     assert "a counter of 32 bits in us that wraps" in table.remarks[0]
 
 
 def test_a_number_since_midnight_goes_on_over_midnight(tmp_path: Path) -> None:
     path = tmp_path / "run.mat"
-    since_midnight_ms = (86_400_000 - 12 + 4 * np.arange(6)) % 86_400_000
-    savemat(path, {"t": since_midnight_ms.astype(np.uint32), "q": np.arange(6.0)})
-    column = TimeColumn(file="run.mat", column="t", unit=TimeUnit.MILLISECOND)
-    table = read_mat(path, ImportDescription.model_construct(), ("q",), column)
+    day_ms = 86_400_000
+    since_midnight_ms = (day_ms - 12 + 4 * np.arange(6)) % day_ms
+    table = _read_with_time(path, since_midnight_ms.astype(np.uint32), TimeUnit.MILLISECOND)
     assert table.stamps is not None
-    expected = 0.004 * np.arange(6)
-    assert table.stamps.time_s == pytest.approx(expected, abs=1e-9)
+    expected_s = 0.004 * np.arange(6)
+    assert table.stamps.time_s == pytest.approx(expected_s, abs=1e-9)
     assert "times of day that pass midnight" in table.remarks[0]

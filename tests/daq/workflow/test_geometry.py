@@ -32,6 +32,7 @@ from daq.workflow.fit import (
     fit,
 )
 from daq.workflow.geometry_diagnoses import calibrated_model, encoder_misfit_of, geometry_diagnoses
+from ident.calibration import Calibration
 from ident.data.dataset import differentiate
 from ident.data.run import Run
 from ident.discovery.evidence import gather, with_effects
@@ -46,6 +47,7 @@ from ident.estimators.method import Method
 from ident.model.closed_chain import positions, reach
 from ident.model.geometry import GeometryKind, GeometryParameter, described_length
 from ident.model.model import Column
+from ident.model.robot import Robot
 from tests.conftest import CHECKOUT
 from tests.daq.calibrations import RECORDED
 
@@ -59,6 +61,10 @@ ZERO = GeometryParameter(GeometryKind.ZERO, "crank-2")
 ROD = GeometryParameter(GeometryKind.LENGTH, "elbow-3", "arm-3")
 RATE_HZ = 250.0
 COUNT_RAD = 2.0 * np.pi / (65536 * 5)
+LINK = (0.004, 0.0, 0.0, 0.005, 0.0, 0.006, 0.08, 0.01, 0.0, 0.8)
+"""Inertia, first moments and mass of each link."""
+AXIS = (0.03, 0.1, 0.3, 0.02)
+"""Rotor inertia and friction of each axis."""
 
 
 def with_corrected_geometry(start: Fit) -> Fit:
@@ -74,17 +80,19 @@ def _positions(seed: int) -> FloatArray:
     """
     model = model_of(CELL)
     rng = np.random.default_rng(seed)
-    time_s = np.arange(0.0, 9.0, 1.0 / RATE_HZ)[:, None, None]
+    time_s = np.arange(0.0, 9.0, 1.0 / RATE_HZ)
     frequency_hz = rng.uniform(0.2, 1.4, (4, 5))
-    phase = rng.uniform(0.0, 2.0 * np.pi, (4, 5))
-    phase_sine = np.sin(2.0 * np.pi * frequency_hz * time_s + phase)
-    wished = 0.06 * np.sum(phase_sine, axis=2)
+    start_phase = rng.uniform(0.0, 2.0 * np.pi, (4, 5))
+    turns = frequency_hz * time_s[:, None, None]
+    waves = np.sin(2.0 * np.pi * turns + start_phase)
+    wished = 0.06 * np.sum(waves, axis=2)
     axis_joints = list(model.robot.axis_joints)
     home = model.assembly.position_rad[axis_joints]
     axes_rad = home + wished
     found = reach(model.robot, model.assembly, axes_rad).position_rad
-    axes = found[:, list(model.robot.axis_joints)]
-    assert np.allclose(positions(model.robot, model.assembly, axes), found, atol=1e-8)
+    axes = found[:, axis_joints]
+    closed = positions(model.robot, model.assembly, axes)
+    assert np.allclose(closed, found, atol=1e-8)
     return axes
 
 
@@ -95,39 +103,37 @@ def _runs() -> tuple[Run, Run]:
     rng = np.random.default_rng(0)
     standard = np.zeros(len(model.columns))
     for columns in model.link_columns:
-        standard[columns] = 0.004, 0.0, 0.0, 0.005, 0.0, 0.006, 0.08, 0.01, 0.0, 0.8
+        standard[columns] = LINK
     for joint in model.robot.axis_joints:
-        standard[14 * joint + 10 : 14 * joint + 14] = 0.03, 0.1, 0.3, 0.02
+        first = 14 * joint + 10
+        standard[first : first + 4] = AXIS
     body = CELL.payloads[0].payload
     made: list[Run] = []
-    for seed, payload in ((3, None), (4, body)):
+    for name, seed, payload in (("bare", 3, None), ("loaded", 4, body)):
         exact = _positions(seed)
         time_s = np.arange(len(exact)) / RATE_HZ
-        current_a = np.zeros_like(exact)
-        blank = Run(
-            LOGS[len(made)].stem,
-            time_s,
-            exact,
-            current_a,
-            payload,
-        )
+        no_current = np.zeros_like(exact)
+        blank = Run(name, time_s, exact, no_current, payload)
         data = differentiate(blank, model.drive_train, CELL.conditioning)
         mounted = standard.copy()
         if payload is not None:
             mass_kg = payload.known["m"]
             mounted[model.flange] += 0.05, 0.0, 0.0, 0.05, 0.0, 0.09, 0.9, 0.3, 0.0, mass_kg
-        torque = np.einsum("mck,c->km", model.regressor(data.motion()), mounted)
-        to_motors = model.follow(data.motion()).to_motors
+        motion = data.motion()
+        torque = np.einsum("mck,c->km", model.regressor(motion), mounted)
+        to_motors = model.follow(motion).to_motors
         hidden = np.linalg.qr(to_motors, mode="complete").Q[:, :, 3]
         hidden_sign = np.sign(hidden[:, :1])
-        hidden = hidden * hidden_sign
-        torque = torque + (1.0 + 2.0 * np.sin(1.3 * data.time_s))[:, None] * hidden
-        current = 0.004 * rng.standard_normal(exact.shape)
-        current[1:-1] += torque / GAINS
-        counted = COUNT_RAD * np.round(exact / COUNT_RAD)
-        changed_blank = replace(blank, position_rad=counted, current_a=current)
-        made.append(changed_blank)
-    return made[0], made[1]
+        preload_nm = 1.0 + 2.0 * np.sin(1.3 * data.time_s)
+        preload = preload_nm[:, None] * hidden * hidden_sign
+        current_a = 0.004 * rng.standard_normal(exact.shape)
+        current_a[1:-1] += (torque + preload) / GAINS
+        counts = np.round(exact / COUNT_RAD)
+        position_rad = COUNT_RAD * counts
+        run = replace(blank, position_rad=position_rad, current_a=current_a)
+        made.append(run)
+    bare, loaded = made
+    return bare, loaded
 
 
 def _read(cell: Cell, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -148,16 +154,17 @@ def _read(cell: Cell, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def _with_zero(degrees: float) -> Cell:
-    axes = [
-        replace(one, zero_offset_rad=radians(degrees)) if one.name == "crank-2" else one
-        for one in CELL.axes
-    ]
+    names = [axis.name for axis in CELL.axes]
+    number = names.index("crank-2")
+    axes = list(CELL.axes)
+    axes[number] = replace(axes[number], zero_offset_rad=radians(degrees))
     return replace(CELL, axes=tuple(axes))
 
 
 def _with_rod(percent: float) -> Cell:
     before, name, after = CELL.urdf.partition('<joint name="tip-3"')
-    longer = f'xyz="{0.28 * (1.0 + percent / 100.0)!r} 0 0"'
+    length_m = 0.28 * (1.0 + percent / 100.0)
+    longer = f'xyz="{length_m!r} 0 0"'
     changed_after = after.replace('xyz="0.28 0 0"', longer, 1)
     urdf = before + name + changed_after
     return replace(CELL, urdf=urdf)
@@ -167,6 +174,19 @@ def _errors(fitted: Fit) -> FloatArray:
     """Errors of the gains in their σ."""
     gain_difference = fitted.estimate.gains - GAINS
     return np.asarray(gain_difference / fitted.estimate.gains_std)
+
+
+def _saved_and_loaded(calibration: Calibration, folder: Path) -> Calibration:
+    path = folder / "calibration.yaml"
+    save_calibration(calibration, path)
+    return load_calibration(path)
+
+
+def _angle_between(first: FloatArray, second: FloatArray) -> float:
+    """Angle of the turn from one rotation matrix to another."""
+    turn = first.T @ second
+    cosine = 0.5 * (np.trace(turn) - 1.0)
+    return float(np.arccos(np.clip(cosine, -1.0, 1.0)))
 
 
 @pytest.fixture(scope="module")
@@ -181,11 +201,14 @@ def test_a_right_description_is_fitted_as_it_is(clean: Fit) -> None:
     assert not clean.geometry.is_significant
     assert clean.diagnoses == ()
     assert with_corrected_geometry(clean) is clean
-    kept = calibration_of(clean, RECORDED).encoder_misfit
-    assert kept is not None
-    expected = (False, False, (), "rad")
-    assert (kept.applied, kept.significant, kept.corrections, kept.unit) == expected
-    assert np.all(np.abs(_errors(clean)) < 3.0)
+    misfit = calibration_of(clean, RECORDED).encoder_misfit
+    assert misfit is not None
+    assert misfit.applied is False
+    assert misfit.significant is False
+    assert misfit.corrections == ()
+    assert misfit.unit == "rad"
+    errors = np.abs(_errors(clean))
+    assert np.all(errors < 3.0)
 
 
 @pytest.mark.parametrize(
@@ -216,8 +239,9 @@ def test_a_wrong_number_is_named_and_corrected(
     _read(cell, monkeypatch)
     fitted = fit(LOGS)
     first = fitted.diagnoses[0]
+    axes = ("crank-2",) if parameter is ZERO else ()
     assert first.name == name
-    assert first.axes == (("crank-2",) if parameter is ZERO else ())
+    assert first.axes == axes
     assert "explains alone" in first.found
     assert re.search(remedy, first.remedy)
     assert "described geometry" in first.remedy
@@ -228,32 +252,38 @@ def test_a_wrong_number_is_named_and_corrected(
     assert change_difference < 4.0 * correction.std
     corrected = with_corrected_geometry(fitted)
     assert with_corrected_geometry(corrected) is corrected
-    assert np.all(np.abs(_errors(corrected)) < 3.0)
+    errors_corrected = np.abs(_errors(corrected))
+    assert np.all(errors_corrected < 3.0)
     if parameter is ZERO:
-        assert np.max(np.abs(_errors(fitted))) > 3.0
-    assert np.all(corrected.estimate.gains_std < 1.5 * clean.estimate.gains_std)
+        errors = np.abs(_errors(fitted))
+        assert np.max(errors) > 3.0
+    gains_std = corrected.estimate.gains_std
+    limit = 1.5 * clean.estimate.gains_std
+    assert np.all(gains_std < limit)
     assert corrected.geometry_covariance is not None
-    geometry_covariance_diagonal = np.diag(corrected.geometry_covariance)
-    added = np.sqrt(geometry_covariance_diagonal)[: len(GAINS)]
-    assert np.all((added > 0.0) & (added < corrected.estimate.gains_std))
+    variances = np.diag(corrected.geometry_covariance)
+    of_gains = variances[: len(GAINS)]
+    added = np.sqrt(of_gains)
+    assert np.all(added > 0.0)
+    assert np.all(added < gains_std)
     (diagnosis,) = geometry_diagnoses(corrected.geometry, cell, applied=True)
     assert "corrected geometry" in diagnosis.remedy
     # The calibration keeps the correction, and predicts with it, whatever the description says now.
     changed_corrected = replace(corrected, diagnoses=(diagnosis,))
     calibration = calibration_of(changed_corrected, RECORDED)
-    save_calibration(calibration, tmp_path / "calibration.yaml")
-    read = load_calibration(tmp_path / "calibration.yaml")
+    read = _saved_and_loaded(calibration, tmp_path)
     assert read.encoder_misfit == calibration.encoder_misfit
+    joints = model_of(CELL).robot.joints
     for described in (cell, CELL):
         robot = calibrated_model(read, described).robot
-        turned = robot.joints[robot.axis_joints[1]].rotation
-        joints = model_of(CELL).robot.joints
-        expected = joints[robot.axis_joints[1]].rotation
-        offset = described.axes[1].zero_offset_rad
-        assert np.arccos(
-            np.clip(0.5 * (np.trace(expected.T @ turned) - 1.0), -1.0, 1.0)
-        ) == pytest.approx(offset, abs=2e-5)
-        assert described_length(robot, ROD) == pytest.approx(0.28, abs=2e-6)
+        second_joint = robot.axis_joints[1]
+        turned = robot.joints[second_joint].rotation
+        right = joints[second_joint].rotation
+        offset_rad = described.axes[1].zero_offset_rad
+        angle_rad = _angle_between(right, turned)
+        assert angle_rad == pytest.approx(offset_rad, abs=2e-5)
+        rod_m = described_length(robot, ROD)
+        assert rod_m == pytest.approx(0.28, abs=2e-6)
     if parameter is ZERO:
         assert calibration.encoder_misfit is not None
         first_correction = calibration.encoder_misfit.corrections[0]
@@ -284,22 +314,29 @@ def test_the_uncertainty_of_the_geometry_reaches_the_gains_beside_effects(clean:
     # turn of gravity.
     reversed_unknowns = reversed(evidence.estimate.unknowns)
     unknowns = (Column("of another gravity", "kg m"), *reversed_unknowns)
-    extra = np.diag(np.arange(1.0, count + 2.0))
+    added_variances = np.arange(1.0, count + 2.0)
+    extra = np.diag(added_variances)
     changed = evidence_with_geometry(joined, extra, unknowns)
     covariance_difference = changed.estimate.covariance - joined.estimate.covariance
     difference = np.diag(covariance_difference)
+    of_gains = list(difference[:gains])
+    assert of_gains == pytest.approx([1.0, 2.0, 3.0, 4.0])
+    unknown_names = [column.name for column in unknowns]
+    added = dict(zip(unknown_names, added_variances[gains:], strict=True))
     names = [column.name for column in joined.estimate.unknowns]
-    added = {column.name: float(number) for number, column in enumerate(unknowns, start=gains + 1)}
-    assert list(difference[:gains]) == pytest.approx([1.0, 2.0, 3.0, 4.0])
-    assert list(difference[gains:]) == pytest.approx([added.get(name, 0.0) for name in names])
-    assert sum(name in added for name in names) == count - gains
+    of_names = [added.get(name, 0.0) for name in names]
+    of_parameters = list(difference[gains:])
+    assert of_parameters == pytest.approx(of_names)
+    found_names = [name for name in names if name in added]
+    assert len(found_names) == count - gains
     assert changed.identification.estimate is changed.estimate
 
 
 def test_the_uncertainty_of_the_geometry_is_in_sigma_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """After a search that adds nothing, σ is that of the fit with the corrected geometry."""
     _read(_with_zero(0.5), monkeypatch)
-    monkeypatch.setattr(fitting, "find_effects", partial(find_effects, families=(), geometry=()))
+    find_none = partial(find_effects, families=(), geometry=())
+    monkeypatch.setattr(fitting, "find_effects", find_none)
     fitted = fit(LOGS, keep_rows=True)
     closed = close_loop(fitted, 0)
     last_step = closed.steps[-1]
@@ -308,13 +345,14 @@ def test_the_uncertainty_of_the_geometry_is_in_sigma_once(monkeypatch: pytest.Mo
     bare = closed.evidence().training.system()
     covariance = estimate_with(Method.ML, bare).covariance
     expected = covariance + closed.geometry_covariance
-    assert closed.identification.estimate.covariance == pytest.approx(expected, rel=1e-6, abs=1e-15)
-    expected_diagonal_root = np.sqrt(np.diag(expected))
-    assert closed.estimate.gains_std == pytest.approx(
-        expected_diagonal_root[: len(GAINS)], rel=1e-6
-    )
+    found = closed.identification.estimate.covariance
+    assert found == pytest.approx(expected, rel=1e-6, abs=1e-15)
+    std = np.sqrt(np.diag(expected))
+    expected_std = std[: len(GAINS)]
+    gains_std = closed.estimate.gains_std
+    assert gains_std == pytest.approx(expected_std, rel=1e-6)
     again = close_loop(closed, 0)
-    assert again.estimate.gains_std == pytest.approx(closed.estimate.gains_std, rel=1e-6)
+    assert again.estimate.gains_std == pytest.approx(gains_std, rel=1e-6)
 
 
 def test_the_alternative_that_moves_gains_by_most_of_their_sigma_counts(clean: Fit) -> None:
@@ -322,19 +360,24 @@ def test_the_alternative_that_moves_gains_by_most_of_their_sigma_counts(clean: F
     by one.
     """
     std = clean.estimate.gains_std
-    few = np.zeros(len(clean.estimate.covariance))
-    few[int(np.argmax(std))] = 1.0 * std.max()
-    many = np.zeros(len(clean.estimate.covariance))
-    many[int(np.argmin(std))] = 3.0 * std.min()
+    count = len(clean.estimate.covariance)
+    least_known = int(np.argmax(std))
+    best_known = int(np.argmin(std))
+    few = np.zeros(count)
+    few[least_known] = 1.0 * std[least_known]
+    many = np.zeros(count)
+    many[best_known] = 3.0 * std[best_known]
     shift = shift_in_sigmas(few, clean.estimate)
     assert shift == pytest.approx(1.0)
-    assert shift_in_sigmas(many, clean.estimate) == pytest.approx(3.0)
+    shift = shift_in_sigmas(many, clean.estimate)
+    assert shift == pytest.approx(3.0)
 
 
 def _finding(
     *causes: GeometryEstimate, alternatives: tuple[tuple[GeometryEstimate, ...], ...] = ()
 ) -> GeometryFinding:
-    covariance = np.diag([one.std**2 for one in causes])
+    variances = [one.std**2 for one in causes]
+    covariance = np.diag(variances)
     return GeometryFinding(4e-4, 6e-6, 5e-6, True, causes, covariance, alternatives, (), ())
 
 
@@ -347,15 +390,21 @@ def test_what_encoders_cannot_tell_apart_is_said() -> None:
     assert (
         "not distinguishable from a length from elbow-3 to arm-3 that is 0.3000 ± 0.0010 mm shorter"
     ) in one.found
-    (both,) = geometry_diagnoses(_finding(zero, rod), CELL, applied=False)
-    assert (both.name, both.axes) == ("geometry-off", ("crank-2",))
+
+    together = _finding(zero, rod)
+    (both,) = geometry_diagnoses(together, CELL, applied=False)
+    assert both.name == "geometry-off"
+    assert both.axes == ("crank-2",)
     assert "explain together" in both.found
-    kept = encoder_misfit_of(_finding(zero, alternatives=((rod,),)), CELL, applied=True)
-    assert kept is not None
-    assert kept.alternatives == (
+
+    misfit = encoder_misfit_of(finding, CELL, applied=True)
+    assert misfit is not None
+    assert misfit.alternatives == (
         "a length from elbow-3 to arm-3 that is 0.3000 ± 0.0010 mm shorter than described",
     )
-    assert list(geometry_diagnoses(None, CELL, applied=False)) == []
+
+    diagnoses = geometry_diagnoses(None, CELL, applied=False)
+    assert list(diagnoses) == []
 
 
 def test_a_misfit_that_nothing_explains_is_called_so() -> None:
@@ -367,9 +416,9 @@ def test_a_misfit_that_nothing_explains_is_called_so() -> None:
     ) in none.found
     assert none.expected == "0.005 mrad, the noise of the encoders"
     assert "arms that bend, play in joints" in none.remedy
-    kept = encoder_misfit_of(_finding(), CELL, applied=False)
-    assert kept is not None
-    text = encoder_text(kept)
+    misfit = encoder_misfit_of(_finding(), CELL, applied=False)
+    assert misfit is not None
+    text = encoder_text(misfit)
     assert (
         "miss the loops by 0.4 mrad, where their noise is 0.005 mrad, which no zero, length"
     ) in text
@@ -379,23 +428,24 @@ def test_a_misfit_that_nothing_explains_is_called_so() -> None:
 def test_a_late_encoder_is_named_and_not_corrected(tmp_path: Path, clean: Fit) -> None:
     parameter = GeometryParameter(GeometryKind.DELAY, "crank-2")
     late = GeometryEstimate(parameter, 0.003, 1e-6)
-    (one,) = geometry_diagnoses(_finding(late), CELL, applied=False)
-    assert (one.name, one.axes) == ("position-late", ("crank-2",))
+    finding = _finding(late)
+    (one,) = geometry_diagnoses(finding, CELL, applied=False)
+    assert one.name == "position-late"
+    assert one.axes == ("crank-2",)
     assert "an encoder of crank-2 that is late by 3.0000 ± 0.0010 ms explains alone" in one.found
     assert "look for what delays the encoder of crank-2" in one.remedy
     assert "residual" not in one.remedy
-    fitted = replace(clean, geometry=_finding(late))
+    fitted = replace(clean, geometry=finding)
     assert with_corrected_geometry(fitted) is fitted
+
     calibration = calibration_of(fitted, RECORDED)
-    save_calibration(calibration, tmp_path / "calibration.yaml")
-    path = tmp_path / "calibration.yaml"
-    kept = load_calibration(path).encoder_misfit
-    assert kept == calibration.encoder_misfit
-    assert kept is not None
-    assert (kept.corrections, kept.noise) == ((), 5e-6)
-    assert (
-        "explained by an encoder of crank-2 that is late by 3.0000 ± 0.0010 ms"
-    ) in encoder_text(kept)
+    misfit = _saved_and_loaded(calibration, tmp_path).encoder_misfit
+    assert misfit == calibration.encoder_misfit
+    assert misfit is not None
+    assert misfit.corrections == ()
+    assert misfit.noise == 5e-6
+    text = encoder_text(misfit)
+    assert "explained by an encoder of crank-2 that is late by 3.0000 ± 0.0010 ms" in text
 
 
 def test_a_late_encoder_that_may_be_a_wrong_zero_corrects_none() -> None:
@@ -404,10 +454,16 @@ def test_a_late_encoder_that_may_be_a_wrong_zero_corrects_none() -> None:
     late = GeometryEstimate(parameter, 0.003, 1e-6)
     finding = _finding(zero, alternatives=((late,),))
     assert finding.corrections == ()
-    kept = encoder_misfit_of(finding, CELL, applied=False)
-    assert kept is not None
-    assert "explained by the zero of crank-2" in encoder_text(kept)
-    assert "; or by an encoder of crank-2" in encoder_text(kept)
+    misfit = encoder_misfit_of(finding, CELL, applied=False)
+    assert misfit is not None
+    text = encoder_text(misfit)
+    assert "explained by the zero of crank-2" in text
+    assert "; or by an encoder of crank-2" in text
+
+
+def _y_of_crank_3(robot: Robot) -> float:
+    (joint,) = [joint for joint in robot.joints if joint.name == "crank-3"]
+    return float(joint.translation_m[1])
 
 
 def test_a_place_on_the_base_is_named_and_corrected(clean: Fit, tmp_path: Path) -> None:
@@ -415,20 +471,22 @@ def test_a_place_on_the_base_is_named_and_corrected(clean: Fit, tmp_path: Path) 
     place = GeometryEstimate(parameter, -3e-4, 1e-7)
     finding = _finding(place)
     (one,) = geometry_diagnoses(finding, CELL, applied=False)
-    assert (one.name, one.axes) == ("place-off", ())
+    assert one.name == "place-off"
+    assert one.axes == ()
     off = "the place of crank-3 on the base off by -0.3000 ± 0.0001 mm in y (to be added to it)"
     assert f"{off} explains alone" in one.found
     robot = model_of(CELL).robot
-    joints = {joint.name: joint for joint in robot.joints}
-    translation_m = float(joints["crank-3"].translation_m[1])
-    described_mm = 1e3 * translation_m
-    assert f"{described_mm - 0.3:.3f} mm in place of {described_mm:.3f} mm" in one.remedy
+    described_m = _y_of_crank_3(robot)
+    described_mm = 1e3 * described_m
+    corrected_mm = described_mm - 0.3
+    assert f"{corrected_mm:.3f} mm in place of {described_mm:.3f} mm" in one.remedy
+
     geometry_covariance = np.zeros((1, 1))
     fitted = replace(clean, geometry=finding, geometry_covariance=geometry_covariance)
     calibration = calibration_of(fitted, RECORDED)
-    save_calibration(calibration, tmp_path / "calibration.yaml")
-    read = load_calibration(tmp_path / "calibration.yaml")
-    moved = {joint.name: joint for joint in calibrated_model(read, CELL).robot.joints}
-    assert moved["crank-3"].translation_m[1] == pytest.approx(1e-3 * described_mm - 3e-4)
+    read = _saved_and_loaded(calibration, tmp_path)
+    moved_m = _y_of_crank_3(calibrated_model(read, CELL).robot)
+    corrected_m = described_m - 3e-4
+    assert moved_m == pytest.approx(corrected_m)
     assert read.encoder_misfit is not None
     assert off in encoder_text(read.encoder_misfit)

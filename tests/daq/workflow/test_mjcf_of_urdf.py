@@ -25,6 +25,8 @@ from tests.daq.workflow.test_export_mjcf import SAME, is_moving
 pytestmark = pytest.mark.slow
 
 FloatArray = NDArray[np.float64]
+ROBOTS = CHECKOUT / "configs/robots"
+CELLS = CHECKOUT / "configs/cells"
 CORNERS = ((0.0, 0.0, 0.0), (0.3, 0.0, 0.0), (0.0, 0.2, 0.0), (0.0, 0.0, 0.1))
 FACES = ((0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3))
 SQUARE = ((0.0, 0.0, 0.0), (0.1, 0.0, 0.0), (0.1, 0.1, 0.0), (0.0, 0.1, 0.0))
@@ -35,17 +37,20 @@ COLLISION_GROUP = 3
 
 def stl_of(faces: Sequence[Sequence[int]], points: Sequence[Sequence[float]] = CORNERS) -> bytes:
     """A binary STL of triangles between points."""
-    packed = struct.pack("<I", len(faces))
-    body = bytearray(b" " * 80 + packed)
+    header = b" " * 80
+    face_count = struct.pack("<I", len(faces))
+    body = bytearray(header + face_count)
+    vertices = np.array(points)
+    normal = (0.0, 0.0, 0.0)
     for face in faces:
-        corners = np.array(points)[list(face)].ravel()
-        body += struct.pack("<12fH", 0.0, 0.0, 0.0, *corners, 0)
+        corners = vertices[list(face)].ravel()
+        body += struct.pack("<12fH", *normal, *corners, 0)
     return bytes(body)
 
 
 def with_shapes(robot: str, shapes: dict[str, str], head: str = "") -> str:
     """The URDF of a shipped robot with shapes in some links."""
-    urdf = (CHECKOUT / f"configs/robots/{robot}.urdf").read_text()
+    urdf = (ROBOTS / f"{robot}.urdf").read_text()
     for link, text in shapes.items():
         tag = f'<link name="{link}">'
         assert urdf.count(tag) == 1
@@ -70,12 +75,10 @@ def inverse_nm(simulated: Any, robot: CalibratedRobot) -> FloatArray:
     data = mujoco.MjData(simulated)
     torques = []
     states = robot.states
-    for position, velocity, acceleration in zip(
-        states.position_rad, states.velocity_rad_s, states.acceleration_rad_s2, strict=True
-    ):
-        data.qpos[:] = position
-        data.qvel[:] = velocity
-        data.qacc[:] = acceleration
+    for state in range(len(states.position_rad)):
+        data.qpos[:] = states.position_rad[state]
+        data.qvel[:] = states.velocity_rad_s[state]
+        data.qacc[:] = states.acceleration_rad_s2[state]
         mujoco.mj_inverse(simulated, data)
         torques.append(data.qfrc_inverse.copy())
     return np.array(torques).T
@@ -84,13 +87,30 @@ def inverse_nm(simulated: Any, robot: CalibratedRobot) -> FloatArray:
 def missing_nm(report: dict[str, Any], robot: CalibratedRobot) -> FloatArray:
     """Torque that the document says the model lacks, shape (m, k)."""
     value_of = {entry["name"]: entry["value"] for entry in report["not_in_mjcf"]}
-    values = np.array([value_of.get(column.name, 0.0) for column in robot.model.columns])
-    return np.asarray(np.einsum("jck,c->jk", robot.model.regressor(robot.states), values))
+    values = [value_of.get(column.name, 0.0) for column in robot.model.columns]
+    regressor = robot.model.regressor(robot.states)
+    torque_nm = np.einsum("jck,c->jk", regressor, np.array(values))
+    return np.asarray(torque_nm)
+
+
+def check_torques(
+    simulated: Any, report: dict[str, Any], robot: CalibratedRobot, use: NDArray[np.bool_]
+) -> None:
+    """MuJoCo's torques are the predicted ones in the states to use."""
+    found_nm = inverse_nm(simulated, robot) + missing_nm(report, robot)
+    predicted_nm = robot.predicted_nm()
+    assert apart(found_nm[:, use], predicted_nm[:, use]) <= SAME
+
+
+def export_code(*arguments: object) -> int:
+    """Run the command; its exit code."""
+    texts = [str(argument) for argument in arguments]
+    return main(["export", "mjcf", *texts])
 
 
 def export(capsys: pytest.CaptureFixture[str], *arguments: object) -> dict[str, Any]:
     """Run the command."""
-    assert main(["export", "mjcf", *map(str, arguments), "--json"]) == 0
+    assert export_code(*arguments, "--json") == 0
     printed = capsys.readouterr().out
     report: dict[str, Any] = json.loads(printed)
     return report
@@ -123,7 +143,8 @@ def urdf_of_arm(tmp_path: Path) -> Path:
         '<joint name="mount" type="fixed"><origin xyz="0.1 0.02 0.3" rpy="0.4 -0.2 1.1"/>'
         '<parent link="link6"/><child link="tool"/></joint></robot>'
     )
-    path.write_text(with_shapes("tx40", SHAPES, head).replace("</robot>", tool))
+    urdf = with_shapes("tx40", SHAPES, head)
+    path.write_text(urdf.replace("</robot>", tool))
     return path
 
 
@@ -134,37 +155,41 @@ def test_a_urdf_alone_gives_the_predicted_torque_with_its_shapes(
     robot = uncoupled_arm(tmp_path)
     out = tmp_path / "models/robot.xml"
     out.parent.mkdir()
-    report = export(capsys, robot.saved(tmp_path), "--urdf", urdf_of_arm, "--out", out)
+    calibration = robot.saved(tmp_path)
+
+    report = export(capsys, calibration, "--urdf", urdf_of_arm, "--out", out)
+
     assert report["same_configuration"] is None
     assert report["shapes_left_out"] == []
-    assert [Path(mesh).name for mesh in report["meshes"]] == ["flat.STL", "link 2.stl"]
+    mesh_names = [Path(mesh).name for mesh in report["meshes"]]
+    assert mesh_names == ["flat.STL", "link 2.stl"]
     simulated = loaded(out)
     # Stops of the URDF, which are narrower than those of the cell, push back.
     position_rad = robot.states.position_rad
     lower_rad, upper_rad = simulated.jnt_range.T
-    is_free = ((position_rad > lower_rad) & (position_rad < upper_rad)).all(axis=1)
-    moving = is_moving(robot) & is_free
+    is_inside = (position_rad > lower_rad) & (position_rad < upper_rad)
+    moving = is_moving(robot) & is_inside.all(axis=1)
     assert moving.sum() >= 50
-    found = inverse_nm(simulated, robot) + missing_nm(report, robot)
-    assert apart(found[:, moving], robot.predicted_nm()[:, moving]) <= SAME
+    check_torques(simulated, report, robot, moving)
     joints = [joint.name for joint in robot.model.robot.joints]
-    assert [simulated.joint(number).name for number in range(simulated.njnt)] == joints
-    assert {simulated.body(number).name for number in range(1, simulated.nbody)} == {
-        f"link{i}" for i in range(1, 7)
-    }
+    simulated_joints = [simulated.joint(number).name for number in range(simulated.njnt)]
+    assert simulated_joints == joints
+    bodies = {simulated.body(number).name for number in range(1, simulated.nbody)}
+    assert bodies == {"link1", "link2", "link3", "link4", "link5", "link6"}
 
 
 def uncoupled_arm(folder: Path) -> CalibratedRobot:
     """The TX-40 with a motor for each joint."""
     coupled = "- [0, 0, 0, 0, 32, 32]"
-    text = (CHECKOUT / "configs/cells/tx40.yaml").read_text()
+    text = (CELLS / "tx40.yaml").read_text()
     assert text.count(coupled) == 1
     (folder / "cells").mkdir()
     (folder / "robots").mkdir()
-    content = (CHECKOUT / "configs/robots/tx40.urdf").read_bytes()
+    content = (ROBOTS / "tx40.urdf").read_bytes()
     (folder / "robots/tx40.urdf").write_bytes(content)
     cell = folder / "cells/tx40.yaml"
-    cell.write_text(text.replace(coupled, "- [0, 0, 0, 0, 0, 32]"))
+    uncoupled = text.replace(coupled, "- [0, 0, 0, 0, 0, 32]")
+    cell.write_text(uncoupled)
     return calibrated_robot(cell)
 
 
@@ -173,55 +198,73 @@ def test_shapes_are_where_the_urdf_has_them(
 ) -> None:
     robot = uncoupled_arm(tmp_path)
     out = tmp_path / "robot.xml"
-    export(capsys, robot.saved(tmp_path), "--urdf", urdf_of_arm, "--out", out)
+    calibration = robot.saved(tmp_path)
+    export(capsys, calibration, "--urdf", urdf_of_arm, "--out", out)
     simulated = loaded(out)
     data = mujoco.MjData(simulated)
     data.qpos[:] = robot.states.position_rad[3]
     mujoco.mj_kinematics(simulated, data)
     placed = poses(robot.model.robot, robot.states.position_rad[3:4])
-    geoms = {
-        (simulated.body(geom.bodyid[0]).name, geom.group[0]): geom for geom in geoms_of(simulated)
-    }
-    assert set(geoms) == {
-        ("link1", VISUAL_GROUP),
-        ("link2", VISUAL_GROUP),
-        ("link3", VISUAL_GROUP),
-        ("link3", COLLISION_GROUP),
-        ("link5", VISUAL_GROUP),
-        ("link6", VISUAL_GROUP),
-    }
+
+    visuals: dict[str, Any] = {}
+    collisions: dict[str, Any] = {}
+    of_groups = {VISUAL_GROUP: visuals, COLLISION_GROUP: collisions}
+    for geom in geoms_of(simulated):
+        link = body_name(simulated, geom)
+        of_group = of_groups[geom.group[0]]
+        assert link not in of_group
+        of_group[link] = geom
+    assert set(visuals) == {"link1", "link2", "link3", "link5", "link6"}
+    assert set(collisions) == {"link3"}
     assert not simulated.geom_contype.any()
     assert not simulated.geom_conaffinity.any()
-    assert geoms["link1", VISUAL_GROUP].size == pytest.approx((0.1, 0.2, 0.3))
-    rgba = geoms["link1", VISUAL_GROUP].rgba
-    assert rgba == pytest.approx((0.25, 0.5, 0.75, 1.0))
-    assert geoms["link3", COLLISION_GROUP].size[:2] == pytest.approx((0.05, 0.2))
-    assert geoms["link5", VISUAL_GROUP].rgba == pytest.approx((1.0, 0.0, 0.0, 0.5))
+
+    box = visuals["link1"]
+    assert box.size == pytest.approx((0.1, 0.2, 0.3))
+    assert box.rgba == pytest.approx((0.25, 0.5, 0.75, 1.0))
+    cylinder = collisions["link3"]
+    assert cylinder.size[:2] == pytest.approx((0.05, 0.2))
+    sphere = visuals["link5"]
+    assert sphere.rgba == pytest.approx((1.0, 0.0, 0.0, 0.5))
+
     # Corners of the mesh in the world: by the model, and by the URDF.
-    geom = geoms["link2", VISUAL_GROUP]
-    first = simulated.mesh_vertadr[geom.dataid[0]]
-    vertices = simulated.mesh_vert[first : first + simulated.mesh_vertnum[geom.dataid[0]]]
-    geom_xmat = data.geom_xmat[geom.id].reshape(3, 3)
-    shown = data.geom_xpos[geom.id] + vertices @ geom_xmat.T
+    geom = visuals["link2"]
+    mesh = geom.dataid[0]
+    first = simulated.mesh_vertadr[mesh]
+    end = first + simulated.mesh_vertnum[mesh]
+    vertices = simulated.mesh_vert[first:end]
+    geom_rotation = data.geom_xmat[geom.id].reshape(3, 3)
+    shown = data.geom_xpos[geom.id] + vertices @ geom_rotation.T
     corners = np.array(CORNERS) * (2.0, 2.0, -2.0)
-    in_link = Rotation.from_euler("xyz", (0.4, -0.5, 0.6)).apply(corners) + np.array(
-        (0.1, 0.2, 0.3)
-    )
-    expected = placed.origin_m[2, 0] + in_link @ placed.rotation[2, 0].T
-    for corner in expected:
-        shown_difference_norm = np.linalg.norm(shown - corner, axis=1)
-        assert shown_difference_norm.min() < 1e-6
+    mesh_rotation = Rotation.from_euler("xyz", (0.4, -0.5, 0.6))
+    mesh_origin_m = np.array((0.1, 0.2, 0.3))
+    in_link = mesh_rotation.apply(corners) + mesh_origin_m
+    link_rotation = placed.rotation[2, 0]
+    in_world = placed.origin_m[2, 0] + in_link @ link_rotation.T
+    for corner in in_world:
+        distances_m = np.linalg.norm(shown - corner, axis=1)
+        assert distances_m.min() < 1e-6
+
     # What is behind a fixed joint is in the frame of its own link.
-    tool = geoms["link6", VISUAL_GROUP]
-    at_tool = placed.origin_m[6, 0] + placed.rotation[6, 0] @ (0.1, 0.02, 0.3)
+    tool = visuals["link6"]
+    flange_rotation = placed.rotation[6, 0]
+    at_tool = placed.origin_m[6, 0] + flange_rotation @ (0.1, 0.02, 0.3)
     assert data.geom_xpos[tool.id] == pytest.approx(at_tool, abs=1e-12)
-    turned = placed.rotation[6, 0] @ Rotation.from_euler("xyz", (0.4, -0.2, 1.1)).as_matrix()
-    assert data.geom_xmat[tool.id].reshape(3, 3) == pytest.approx(turned, abs=1e-12)
+    tool_rotation = Rotation.from_euler("xyz", (0.4, -0.2, 1.1))
+    turned = flange_rotation @ tool_rotation.as_matrix()
+    found_rotation = data.geom_xmat[tool.id].reshape(3, 3)
+    assert found_rotation == pytest.approx(turned, abs=1e-12)
 
 
 def geoms_of(simulated: Any) -> list[Any]:
     """Shapes of a model."""
     return [simulated.geom(number) for number in range(simulated.ngeom)]
+
+
+def body_name(simulated: Any, element: Any) -> Any:
+    """The body of a shape or a site."""
+    body = simulated.body(element.bodyid[0])
+    return body.name
 
 
 def test_limits_are_those_of_the_urdf(
@@ -231,19 +274,25 @@ def test_limits_are_those_of_the_urdf(
     robot = uncoupled_arm(tmp_path)
     urdf = urdf_of_arm.read_text()
     first = urdf.index("<limit")
-    limit = urdf[first : urdf.index("/>", first) + 2]
+    end = urdf.index("/>", first) + 2
+    limit = urdf[first:end]
     changed = urdf.replace(limit, '<limit lower="-1.25" upper="0.5" effort="9" velocity="9"/>', 1)
-    last = changed.rindex("<joint", 0, changed.rindex("<limit"))
-    head = changed[last : changed.index(">", last)]
+    last_limit = changed.rindex("<limit")
+    last = changed.rindex("<joint", 0, last_limit)
+    end = changed.index(">", last)
+    head = changed[last:end]
     changed_head = head.replace("revolute", "continuous")
     changed = changed.replace(head, changed_head)
     urdf_of_arm.write_text(changed)
     out = tmp_path / "robot.xml"
-    export(capsys, robot.saved(tmp_path), "--urdf", urdf_of_arm, "--out", out)
+    calibration = robot.saved(tmp_path)
+
+    export(capsys, calibration, "--urdf", urdf_of_arm, "--out", out)
+
     simulated = loaded(out)
-    assert simulated.joint(0).range == pytest.approx((-1.25, 0.5))
-    expected = [1, 1, 1, 1, 1, 0]
-    assert simulated.jnt_limited.tolist() == expected
+    first_joint = simulated.joint(0)
+    assert first_joint.range == pytest.approx((-1.25, 0.5))
+    assert simulated.jnt_limited.tolist() == [1, 1, 1, 1, 1, 0]
 
 
 def test_the_shapes_of_a_cell_are_those_of_its_urdf(
@@ -254,17 +303,20 @@ def test_the_shapes_of_a_cell_are_those_of_its_urdf(
     (tmp_path / "robots").mkdir()
     (tmp_path / "robots/arm.stl").write_bytes(stl_of(FACES))
     mesh = '<visual><geometry><mesh filename="arm.stl"/></geometry></visual>'
-    (tmp_path / "robots/kr270.urdf").write_text(with_shapes("kr270", {"link3": mesh}))
+    urdf = with_shapes("kr270", {"link3": mesh})
+    (tmp_path / "robots/kr270.urdf").write_text(urdf)
     cell = tmp_path / "cells/kr270.yaml"
-    cell.write_text((CHECKOUT / "configs/cells/kr270.yaml").read_text())
+    cell.write_text((CELLS / "kr270.yaml").read_text())
     robot = calibrated_robot(cell)
     out = tmp_path / "robot.xml"
-    report = export(capsys, cell, robot.saved(tmp_path), "--out", out)
+    calibration = robot.saved(tmp_path)
+
+    report = export(capsys, cell, calibration, "--out", out)
+
     simulated = loaded(out)
-    assert [simulated.body(geom.bodyid[0]).name for geom in geoms_of(simulated)] == ["link3"]
-    moving = is_moving(robot)
-    found = inverse_nm(simulated, robot) + missing_nm(report, robot)
-    assert apart(found[:, moving], robot.predicted_nm()[:, moving]) <= SAME
+    (geom,) = geoms_of(simulated)
+    assert body_name(simulated, geom) == "link3"
+    check_torques(simulated, report, robot, is_moving(robot))
 
 
 def test_shapes_that_mujoco_cannot_read_are_listed_and_the_rest_is_written(
@@ -273,7 +325,8 @@ def test_shapes_that_mujoco_cannot_read_are_listed_and_the_rest_is_written(
     robot = uncoupled_arm(tmp_path)
     meshes = urdf_of_arm.parent.parent / "meshes"
     (meshes / "text.stl").write_text("solid arm\nendsolid arm\n")
-    (meshes / "cut.stl").write_bytes(stl_of(FACES)[:-7])
+    complete = stl_of(FACES)
+    (meshes / "cut.stl").write_bytes(complete[:-7])
     (meshes / "none.stl").write_bytes(stl_of(()))
     (meshes / "arm.dae").write_text("<COLLADA/>")
     wrong = {
@@ -288,26 +341,28 @@ def test_shapes_that_mujoco_cannot_read_are_listed_and_the_rest_is_written(
         '<cylinder radius="0.1" length="-1"/>': "not positive",
         "<cone/>": "<cone>",
     }
-    visuals = "".join(f"<visual><geometry>{text}</geometry></visual>" for text in wrong)
-    urdf = urdf_of_arm.read_text().replace(
-        '<link name="link4">', f'<link name="link4">{visuals}<visual/>'
-    )
+    visuals = [f"<visual><geometry>{text}</geometry></visual>" for text in wrong]
+    link = '<link name="link4">'
+    with_visuals = link + "".join(visuals) + "<visual/>"
+    urdf = urdf_of_arm.read_text().replace(link, with_visuals)
     urdf_of_arm.write_text(urdf)
     out = tmp_path / "robot.xml"
     file = robot.saved(tmp_path)
+
     report = export(capsys, file, "--urdf", urdf_of_arm, "--out", out)
-    wrong_count_expected = len(wrong) + 1
-    assert len(report["shapes_left_out"]) == wrong_count_expected
-    for reason, expected in zip(
-        report["shapes_left_out"], [*wrong.values(), "0 geometries"], strict=True
-    ):
+
+    left_out = report["shapes_left_out"]
+    reasons = [*wrong.values(), "0 geometries"]
+    assert len(left_out) == len(reasons)
+    for reason, expected in zip(left_out, reasons, strict=True):
         assert reason.startswith("visual of link4: ")
         assert expected in reason
     assert loaded(out).ngeom == 6
     assert "Shapes NOT in this model: visual of link4: " in out.read_text()
-    assert main(["export", "mjcf", str(file), "--urdf", str(urdf_of_arm), "--out", str(out)]) == 0
+    assert export_code(file, "--urdf", urdf_of_arm, "--out", out) == 0
     printed = capsys.readouterr().out
-    assert ("Shapes that are not in the model: visual of link4: ") in " ".join(printed.split())
+    words = " ".join(printed.split())
+    assert "Shapes that are not in the model: visual of link4: " in words
 
 
 def test_a_urdf_of_another_robot_is_refused(
@@ -316,19 +371,16 @@ def test_a_urdf_of_another_robot_is_refused(
     robot = robot_of("kr270")
     file = robot.saved(tmp_path)
     out = tmp_path / "robot.xml"
-    robots = CHECKOUT / "configs/robots"
-    command = ["export", "mjcf", str(file), "--out", str(out), "--urdf"]
-    assert main([*command, str(robots / "seven-axis.urdf")]) == 6
+    seven_axis = ROBOTS / "seven-axis.urdf"
+    assert export_code(file, "--out", out, "--urdf", seven_axis) == 6
     assert "7 moving joints: J1" in capsys.readouterr().err
-    assert main([*command, str(robots / "kr270.urdf")]) == 4  # its wrist is coupled
+    own = ROBOTS / "kr270.urdf"  # its wrist is coupled
+    assert export_code(file, "--out", out, "--urdf", own) == 4
     bomb = tmp_path / "bomb.urdf"
     bomb.write_text('<!DOCTYPE robot [<!ENTITY a "b">]><robot name="r"/>')
-    assert main([*command, str(bomb)]) == 6
-    assert (
-        main(["export", "mjcf", str(robot.cell_file), *command[2:], str(robots / "kr270.urdf")])
-        == 2
-    )
-    assert main(["export", "mjcf", str(file), "--out", str(out)]) == 2
+    assert export_code(file, "--out", out, "--urdf", bomb) == 6
+    assert export_code(robot.cell_file, file, "--out", out, "--urdf", own) == 2
+    assert export_code(file, "--out", out) == 2
     assert not out.exists()
 
 
@@ -337,8 +389,10 @@ def test_a_frame_on_the_base_is_a_site_of_the_world(
 ) -> None:
     robot = uncoupled_arm(tmp_path)
     out = tmp_path / "robot.xml"
-    export(capsys, robot.saved(tmp_path), "--urdf", urdf_of_arm, "--out", out)
+    calibration = robot.saved(tmp_path)
+    export(capsys, calibration, "--urdf", urdf_of_arm, "--out", out)
     simulated = loaded(out)
-    bodyid = simulated.site("base").bodyid
-    assert bodyid[0] == 0
-    assert simulated.body(simulated.site("tool").bodyid[0]).name == "link6"
+    base = simulated.site("base")
+    assert base.bodyid[0] == 0
+    tool = simulated.site("tool")
+    assert body_name(simulated, tool) == "link6"

@@ -30,8 +30,14 @@ from tests.drivers.scripted import PERIOD_NS, ScriptedBus, cell, permission
 
 Moving = tuple[CanopenNetwork, SyncStream, ScriptedBus, list[CellEvent]]
 BOUNDS = MotionBounds(
-    enable_s=0.1, acknowledge_s=0.05, settle_s=0.05, stop_s=0.1, standstill_cycles=5
+    enable_s=0.1,
+    acknowledge_s=0.05,
+    settle_s=0.05,
+    stop_s=0.1,
+    standstill_cycles=5,
 )
+NO_POWER = (0x40, 0x08, 0x28)
+"""States that are told by bits 0 to 3, 5 and 6 of the statusword."""
 MARKS = (EventKind.MOVE_START, EventKind.MOVE_END)
 FAR = Move((50_000, -40_000), (100_000, 80_000), (1_000_000, 800_000))
 
@@ -43,12 +49,9 @@ def moving() -> Iterator[Moving]:
     with network:
         network.prepare()
         bus.cycle = -1
-        yield (
-            network,
-            SyncStream(network, LockstepSync(PERIOD_NS, 0.005, clock=bus.clock), events.append),
-            bus,
-            events,
-        )
+        pacing = LockstepSync(PERIOD_NS, 0.005, clock=bus.clock)
+        stream = SyncStream(network, pacing, events.append)
+        yield network, stream, bus, events
         bus.tamper = lambda message: (message,)
         bus.broken = False
         for node in bus.nodes:
@@ -56,9 +59,26 @@ def moving() -> Iterator[Moving]:
 
 
 def powerless(bus: ScriptedBus) -> bool:
-    return all(
-        node.statusword & 0x6F in (0x40, 0x08, 0x28) and not node.moving for node in bus.nodes
-    )
+    states = {node.statusword & 0x6F for node in bus.nodes}
+    is_moving = any(node.moving for node in bus.nodes)
+    return states <= set(NO_POWER) and not is_moving
+
+
+def events_of(events: list[CellEvent], kind: EventKind) -> list[CellEvent]:
+    return [event for event in events if event.kind is kind]
+
+
+def powered_cycles(bus: ScriptedBus) -> list[int]:
+    return [node.powered_cycles for node in bus.nodes]
+
+
+def setpoint_counts(bus: ScriptedBus) -> list[int]:
+    return [len(node.setpoint_cycles) for node in bus.nodes]
+
+
+def both_by(counts: int, acceleration: int = 1_000_000) -> Move:
+    """A move of both axes to one position."""
+    return Move((counts, counts), (100_000, 100_000), (acceleration, acceleration))
 
 
 def run(moving: Moving, *moves: Move) -> list[Sample]:
@@ -68,8 +88,9 @@ def run(moving: Moving, *moves: Move) -> list[Sample]:
 
 def test_axes_start_together_arrive_and_end_without_power(moving: Moving) -> None:
     _, stream, bus, events = moving
-    first = synchronised_move((0, 0), (50_000, -40_000), permission().limits, dwell_cycles=7)
-    second = synchronised_move((50_000, -40_000), (0, 10_000), permission().limits, dwell_cycles=3)
+    limits = permission().limits
+    first = synchronised_move((0, 0), (50_000, -40_000), limits, dwell_cycles=7)
+    second = synchronised_move((50_000, -40_000), (0, 10_000), limits, dwell_cycles=3)
     samples = run(moving, first, second)
     position_counts = samples[-1].position_counts
     assert position_counts == (0, 10_000)
@@ -79,13 +100,12 @@ def test_axes_start_together_arrive_and_end_without_power(moving: Moving) -> Non
     assert bus.nodes[0].setpoint_cycles == expected
     assert len(bus.nodes[0].setpoint_cycles) == 2
     marks = [event for event in events if event.kind in MARKS]
-    assert [(mark.kind, mark.code) for mark in marks] == [
-        (EventKind.MOVE_START, 0),
-        (EventKind.MOVE_END, 0),
-        (EventKind.MOVE_START, 1),
-        (EventKind.MOVE_END, 1),
-    ]
-    starts = [mark.time_ns // PERIOD_NS for mark in marks if mark.kind is EventKind.MOVE_START]
+    kinds = [mark.kind for mark in marks]
+    assert kinds == [*MARKS, *MARKS]
+    codes = [mark.code for mark in marks]
+    assert codes == [0, 0, 1, 1]
+    start_marks = events_of(marks, EventKind.MOVE_START)
+    starts = [mark.time_ns // PERIOD_NS for mark in start_marks]
     assert starts == bus.nodes[0].setpoint_cycles
     assert powerless(bus)
     assert stream.statistics.missing == 0
@@ -109,16 +129,19 @@ def test_the_profile_objects_are_those_of_the_move(moving: Moving) -> None:
     run(moving, FAR)
     written = []
     for node in bus.nodes:
-        written.append((node.value(0x6081, 0), node.value(0x6083, 0), node.value(0x6084, 0)))
+        velocity = node.value(0x6081, 0)
+        acceleration = node.value(0x6083, 0)
+        deceleration = node.value(0x6084, 0)
+        written.append((velocity, acceleration, deceleration))
     expected = [(100_000, 1_000_000, 1_000_000), (80_000, 800_000, 800_000)]
     assert written == expected
 
 
 def test_an_axis_with_no_way_to_go_gets_no_setpoint(moving: Moving) -> None:
     _, _, bus, _ = moving
-    samples = run(
-        moving, Move((5_000, 0), (100_000, 1), (1_000_000, 1)), Move((5_000, 0), (1, 1), (1, 1), 4)
-    )
+    of_first_axis = Move((5_000, 0), (100_000, 1), (1_000_000, 1))
+    of_none = Move((5_000, 0), (1, 1), (1, 1), 4)
+    samples = run(moving, of_first_axis, of_none)
     position_counts = samples[-1].position_counts
     assert position_counts == (5_000, 0)
     assert bus.nodes[1].setpoint_cycles == []
@@ -135,26 +158,34 @@ def test_nothing_is_sent_to_an_axis_whose_position_is_unknown(moving: Moving) ->
     _, _, bus, _ = moving
     for node in bus.nodes:
         node.position = 30_000.0
-    bus.tamper = lambda m: () if m.arbitration_id == 0x182 and bus.cycle < 2 else (m,)
+
+    def drop_two(message: can.Message) -> tuple[can.Message, ...]:
+        is_dropped = message.arbitration_id == 0x182 and bus.cycle < 2
+        return () if is_dropped else (message,)
+
+    bus.tamper = drop_two
     run(moving, Move((30_000, 20_000), (100_000, 100_000), (1_000_000, 1_000_000)))
     targets = []
     for frame in bus.sent:
         if frame.arbitration_id == 0x202:
-            targets.append(int.from_bytes(frame.data[:4], "little", signed=True))
+            target = int.from_bytes(frame.data[:4], "little", signed=True)
+            targets.append(target)
     assert min(targets) == 20_000
 
 
 def test_without_permission_nothing_is_even_enabled(moving: Moving) -> None:
     network, stream, bus, _ = moving
+    narrow = permission(span=40_000)
+    of_three_axes = permission(axes=3)
     with pytest.raises(MotionRefused, match="motion is disabled; pass a MotionPermission"):
         list(execute(network, stream, (FAR,), None, BOUNDS))
     with pytest.raises(
         MotionRefused, match="J1: move 0 goes to 50000 counts, allowed is -40000 to 40000"
     ):
-        list(execute(network, stream, (FAR,), permission(span=40_000), BOUNDS))
+        list(execute(network, stream, (FAR,), narrow, BOUNDS))
     with pytest.raises(MotionRefused, match="limits for 3 axes"):
-        list(execute(network, stream, (FAR,), permission(axes=3), BOUNDS))
-    assert [node.powered_cycles for node in bus.nodes] == [0, 0]
+        list(execute(network, stream, (FAR,), of_three_axes, BOUNDS))
+    assert powered_cycles(bus) == [0, 0]
 
 
 def test_a_drive_in_fault_is_not_enabled(moving: Moving) -> None:
@@ -162,7 +193,7 @@ def test_a_drive_in_fault_is_not_enabled(moving: Moving) -> None:
     bus.nodes[1].fault()
     with pytest.raises(StateRefused, match=r"J2 \(node 2\): asked for OPERATION ENABLED.*FAULT"):
         run(moving, FAR)
-    assert [node.powered_cycles for node in bus.nodes] == [0, 0]
+    assert powered_cycles(bus) == [0, 0]
 
 
 def break_at(bus: ScriptedBus, cycle: int, what: str) -> None:
@@ -220,15 +251,13 @@ def test_every_failure_stops_all_axes(
 @pytest.mark.parametrize("interrupt", [GeneratorExit, KeyboardInterrupt, ZeroDivisionError])
 def test_leaving_the_loop_stops_all_axes(moving: Moving, interrupt: type[BaseException]) -> None:
     network, stream, bus, events = moving
-    with (
-        pytest.raises(interrupt),
-        closing(execute(network, stream, (FAR,), permission(), BOUNDS)) as samples,
-    ):
+    execution = execute(network, stream, (FAR,), permission(), BOUNDS)
+    with pytest.raises(interrupt), closing(execution) as samples:
         for sample in samples:
             if sample.cycle == 60:
                 raise interrupt
     assert powerless(bus)
-    (ended,) = [event for event in events if event.kind is EventKind.ENDED]
+    (ended,) = events_of(events, EventKind.ENDED)
     assert ended.text == "its caller took no more samples"
     assert 0 < bus.nodes[0].position < 50_000
 
@@ -244,19 +273,19 @@ def test_an_interrupt_inside_of_a_cycle_stops_all_axes(moving: Moving) -> None:
     with pytest.raises(KeyboardInterrupt):
         run(moving, FAR)
     assert powerless(bus)
-    texts = [event.text for event in events if event.kind is EventKind.ENDED]
-    assert texts == ["interrupted"]
+    (ended,) = events_of(events, EventKind.ENDED)
+    assert ended.text == "interrupted"
 
 
 def test_a_fault_during_the_last_stop_is_not_forgotten(moving: Moving) -> None:
     _, _, bus, events = moving
 
     def fault_at_stop(cycle: int) -> None:
-        if (
-            any(event.kind is EventKind.STOP for event in events)
-            and bus.nodes[1].statusword & 0x6F == 0x40
-        ):
-            bus.nodes[1].fault()
+        node = bus.nodes[1]
+        has_stopped = events_of(events, EventKind.STOP) != []
+        has_no_power = node.statusword & 0x6F == 0x40
+        if has_stopped and has_no_power:
+            node.fault()
 
     bus.on_cycle = fault_at_stop
     with pytest.raises(DriveFault, match="node 2"):
@@ -285,7 +314,7 @@ def test_a_drive_that_holds_its_acknowledge_until_it_has_arrived_makes_every_mov
     samples = run(moving, FAR, back, FAR)
     position_counts = samples[-1].position_counts
     assert position_counts == (50_000, -40_000)
-    assert [len(node.setpoint_cycles) for node in bus.nodes] == [3, 3]
+    assert setpoint_counts(bus) == [3, 3]
 
 
 def test_an_acknowledge_that_stays_for_ever_is_named_and_the_axes_lose_power(
@@ -330,7 +359,7 @@ def test_a_drive_whose_rpdos_act_before_sync_makes_the_same_moves(moving: Moving
     samples = run(moving, FAR, back)
     position_counts = samples[-1].position_counts
     assert position_counts == (0, 0)
-    assert [len(node.setpoint_cycles) for node in bus.nodes] == [2, 2]
+    assert setpoint_counts(bus) == [2, 2]
     for sample in samples:
         assert not sample.missing
     assert powerless(bus)
@@ -364,12 +393,17 @@ def test_a_short_move_does_not_end_by_a_bit_of_the_move_before(moving: Moving, w
             node.statusword |= 0x0400
 
     bus.on_cycle = hold_bit
-    samples = run(moving, out, Move((way, way), (1, 1), (1, 1)))
-    start, end = (event.time_ns for event in events if event.kind in MARKS and event.code == 0)
-    assert (end - start) * 1e-9 == pytest.approx(duration_s, abs=2e-3)
+    stay = Move((way, way), (1, 1), (1, 1))
+    samples = run(moving, out, stay)
+    start = events_of(events, EventKind.MOVE_START)[0]
+    end = events_of(events, EventKind.MOVE_END)[0]
+    assert start.code == 0
+    assert end.code == 0
+    took_s = (end.time_ns - start.time_ns) * 1e-9
+    assert took_s == pytest.approx(duration_s, abs=2e-3)
     position_counts = samples[-1].position_counts
     assert position_counts == (way, way)
-    at_end = next(sample for sample in samples if sample.time_ns >= end)
+    at_end, *_ = [sample for sample in samples if sample.time_ns >= end.time_ns]
     assert at_end.position_counts == (way, way)
 
 
@@ -382,7 +416,8 @@ def test_a_setpoint_that_still_waits_is_dropped_by_the_stop(
 
     def interrupt(timeout: float | None = None) -> can.Message | None:
         # The set-points are queued right after the SYNC that follows the last profile.
-        if not timeout and last_profile in [frame.arbitration_id for frame in bus.sent[-4:-1]]:
+        sent_before_sync = [frame.arbitration_id for frame in bus.sent[-4:-1]]
+        if not timeout and last_profile in sent_before_sync:
             monkeypatch.setattr(bus, "recv", receive)
             raise KeyboardInterrupt
         return receive(timeout)
@@ -390,11 +425,13 @@ def test_a_setpoint_that_still_waits_is_dropped_by_the_stop(
     monkeypatch.setattr(bus, "recv", interrupt)
     with pytest.raises(KeyboardInterrupt):
         run(moving, FAR)
-    assert last_profile in [frame.arbitration_id for frame in bus.sent]
-    controlwords = [frame.data[4] for frame in bus.sent if frame.arbitration_id in (0x201, 0x202)]
-    for word in controlwords:
-        assert not word & 0x10
-    assert [node.setpoint_cycles for node in bus.nodes] == [[], []]
+    identifiers = [frame.arbitration_id for frame in bus.sent]
+    assert last_profile in identifiers
+    for frame in bus.sent:
+        if frame.arbitration_id in (0x201, 0x202):
+            controlword = frame.data[4]
+            assert not controlword & 0x10
+    assert setpoint_counts(bus) == [0, 0]
     assert powerless(bus)
 
 
@@ -406,15 +443,16 @@ def stop_with(moving: Moving, drift_counts: tuple[float, ...]) -> list[int]:
     stopping: list[int] = []
 
     def drift(cycle: int) -> None:
-        if any(event.kind is EventKind.STOP for event in events):
+        if events_of(events, EventKind.STOP):
             stopping.append(cycle)
+            number = len(stopping) % len(drift_counts)
             for node in bus.nodes:
-                node.position += drift_counts[len(stopping) % len(drift_counts)]
+                node.position += drift_counts[number]
 
     for node in bus.nodes:
         node.quick_stop_stays = True
     bus.on_cycle = drift
-    run(moving, Move((5_000, 5_000), (100_000, 100_000), (1_000_000, 1_000_000)))
+    run(moving, both_by(5_000))
     return stopping
 
 
@@ -452,7 +490,8 @@ def test_every_axis_that_could_not_be_stopped_is_reported(
         patched.setattr(network, "disable", refuse)
         with pytest.raises(StateRefused, match="node 1") as error:
             run(moving, near)
-    assert ["node 2" in note for note in error.value.__notes__] == [True]
+    (note,) = error.value.__notes__
+    assert "node 2" in note
     bus.on_cycle = lambda _cycle: None
 
 
@@ -460,18 +499,20 @@ def test_every_axis_that_could_not_be_stopped_is_reported(
 def test_late_answers_are_waited_for_once_no_axis_has_power(
     moving: Moving, monkeypatch: pytest.MonkeyPatch, confirmed: bool, periods: int
 ) -> None:
-    _, stream, bus, _ = moving
+    network, stream, bus, _ = moving
     waits = list[tuple[int, bool]]()
-    monkeypatch.setattr(
-        stream,
-        "read_on",
-        lambda seconds, lag_s: waits.append((round(seconds * 1e9) // PERIOD_NS, lag_s > 0)),
-    )
+
+    def read_on(seconds: float, lag_s: float) -> None:
+        wait_ns = round(seconds * 1e9)
+        has_lag = lag_s > 0
+        waits.append((wait_ns // PERIOD_NS, has_lag))
+
+    monkeypatch.setattr(stream, "read_on", read_on)
     bus.nodes[0].quick_stop_stays = not confirmed
-    near = Move((500, 500), (100_000, 100_000), (10_000_000, 10_000_000))
+    near = both_by(500, acceleration=10_000_000)
+    bounds = replace(BOUNDS, standstill_cycles=10_000)
     with suppress(StateRefused):
-        bounds = replace(BOUNDS, standstill_cycles=10_000)
-        list(execute(moving[0], stream, (near,), permission(), bounds))
+        list(execute(network, stream, (near,), permission(), bounds))
     assert waits == [(periods, confirmed)]
 
 
@@ -542,15 +583,16 @@ def test_why_the_moves_end_is_in_the_log(moving: Moving) -> None:
     with pytest.raises(MotionTimeout):
         run(moving, FAR)
     kinds = [event.kind for event in events]
-    (ended,) = [event for event in events if event.kind is EventKind.ENDED]
+    (ended,) = events_of(events, EventKind.ENDED)
     assert ended.text.startswith("MotionTimeout: move 0: J2 (node 2) did not")
     limit = kinds.index(EventKind.STOP)
     assert kinds.index(EventKind.ENDED) < limit
 
 
 def test_moves_that_were_made_end_for_no_reason(moving: Moving) -> None:
+    _, _, _, events = moving
     run(moving, FAR)
-    assert EventKind.ENDED not in [event.kind for event in moving[3]]
+    assert events_of(events, EventKind.ENDED) == []
 
 
 def test_a_stop_that_a_fault_began_is_undisturbed(moving: Moving) -> None:

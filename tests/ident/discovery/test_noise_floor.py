@@ -36,17 +36,33 @@ def _with_resting_currents(data: Dataset, rng: np.random.Generator) -> Dataset:
     current_a = data.current_a.copy()
     for motor, moving in enumerate(data.motor_moving.T):
         for dwell in _dwells(~moving):
-            t = np.linspace(-1.0, 1.0, dwell.stop - dwell.start)
+            samples = dwell.stop - dwell.start
+            t = np.linspace(-1.0, 1.0, samples)
             offset, slope, curvature = rng.normal(size=3)
-            current_a[dwell, motor] = offset + slope * t + 0.3 * curvature * t**2
+            bend = 0.3 * curvature * t**2
+            current_a[dwell, motor] = offset + slope * t + bend
     return replace(data, current_a=current_a)
 
 
 def _dwells(still: NDArray[np.bool_]) -> list[slice]:
     """Stretches without motion."""
-    padded = np.concatenate(([0], still.astype(np.int8), [0]))
+    is_still = still.astype(np.int8)
+    padded = np.concatenate(([0], is_still, [0]))
     edges = np.flatnonzero(np.diff(padded)).tolist()
-    return [slice(first, end) for first, end in zip(edges[::2], edges[1::2], strict=True)]
+    starts = edges[::2]
+    ends = edges[1::2]
+    return [slice(first, end) for first, end in zip(starts, ends, strict=True)]
+
+
+def _with_current(data: Dataset, added_a: FloatArray) -> Dataset:
+    """The data with a further current."""
+    current_a = data.current_a + added_a
+    return replace(data, current_a=current_a)
+
+
+def _nowhere_valid(data: Dataset) -> Dataset:
+    valid = np.zeros_like(data.valid)
+    return replace(data, valid=valid)
 
 
 def _noisy(runs: Sequence[Dataset], seed: int = 5) -> tuple[Dataset, ...]:
@@ -54,8 +70,8 @@ def _noisy(runs: Sequence[Dataset], seed: int = 5) -> tuple[Dataset, ...]:
     axes = runs[0].current_a.shape[1]
 
     def with_noise(data: Dataset) -> Dataset:
-        noise_a = NOISE_A[:axes] * rng.standard_normal(data.current_a.shape)
-        return replace(data, current_a=data.current_a + noise_a)
+        unit_noise = rng.standard_normal(data.current_a.shape)
+        return _with_current(data, NOISE_A[:axes] * unit_noise)
 
     return tuple(with_noise(data) for data in runs)
 
@@ -81,18 +97,18 @@ def _small_run(truth: Truth, number: int, bend: Callable[[FloatArray], FloatArra
 
 def _delayed(position: FloatArray, samples: float) -> FloatArray:
     at = np.arange(len(position))
-    axes = [np.interp(at - samples, at, axis) for axis in position.T]
+    earlier = at - samples
+    axes = [np.interp(earlier, at, axis) for axis in position.T]
     return np.stack(axes, axis=1)
 
 
 @pytest.fixture(scope="module")
 def repeated(small_truth: Truth) -> tuple[Dataset, ...]:
     """Three noiseless runs of the same moves, each 2.4 samples later than the one before."""
-    return (
-        _small_run(small_truth, 0, lambda position: _delayed(position, 0.0)),
-        _small_run(small_truth, 1, lambda position: _delayed(position, 2.4)),
-        _small_run(small_truth, 2, lambda position: _delayed(position, 4.8)),
-    )
+    first = _small_run(small_truth, 0, lambda position: _delayed(position, 0.0))
+    second = _small_run(small_truth, 1, lambda position: _delayed(position, 2.4))
+    third = _small_run(small_truth, 2, lambda position: _delayed(position, 4.8))
+    return (first, second, third)
 
 
 def _all(floors: tuple[MotorNoiseFloor | None, ...]) -> tuple[MotorNoiseFloor, ...]:
@@ -106,7 +122,20 @@ def _expected_a(data: Dataset) -> FloatArray:
     """σ of a filtered row of white noise."""
     taps = decimator(data.rate_hz, CONDITIONING.decimation_cutoff_hz).taps
     axes = data.current_a.shape[1]
-    return np.asarray(NOISE_A[:axes] * np.linalg.norm(taps))
+    gain_of_filter = np.linalg.norm(taps)
+    return np.asarray(NOISE_A[:axes] * gain_of_filter)
+
+
+def _at_rest(runs: Sequence[Dataset]) -> tuple[MotorNoiseFloor, ...]:
+    """Floors of six axes."""
+    return _all(noise_floors(runs, CONDITIONING))
+
+
+def _of_small(
+    runs: Sequence[Dataset], sources: Sequence[FloorSource] = tuple(FloorSource)
+) -> tuple[MotorNoiseFloor, ...]:
+    """Floors of three axes."""
+    return _all(noise_floors(runs, SMALL, sources))
 
 
 def _is_within_its_error(floor: MotorNoiseFloor, expected_a: float) -> bool:
@@ -133,20 +162,22 @@ def _assert_unbiased(
     std_percent = [floor.std_percent for floor in draws[0]]
     reported = np.mean(std_percent) / 100.0
     std_of_mean = reported / np.sqrt(relative.size)
-    assert relative.mean() == pytest.approx(1.0, abs=3.0 * std_of_mean + 0.01)
+    limit = 3.0 * std_of_mean + 0.01
+    assert relative.mean() == pytest.approx(1.0, abs=limit)
     assert relative.std() == pytest.approx(reported, rel=rel_of_std)
 
 
 def test_a_known_noise_comes_back(resting: tuple[Dataset, ...]) -> None:
-    floors = _all(noise_floors(_noisy(resting), CONDITIONING))
-    for floor, expected_a in zip(floors, _expected_a(resting[0]), strict=True):
+    floors = _at_rest(_noisy(resting))
+    true_noise_a = _expected_a(resting[0])
+    for floor, expected_a in zip(floors, true_noise_a, strict=True):
         assert _is_within_its_error(floor, expected_a)
         assert floor.std_percent < 20.0
 
 
 @pytest.mark.slow
 def test_the_estimates_scatter_as_they_say_and_are_not_biased(resting: tuple[Dataset, ...]) -> None:
-    draws = [_all(noise_floors(_noisy(resting, seed), CONDITIONING)) for seed in range(20)]
+    draws = [_at_rest(_noisy(resting, seed)) for seed in range(20)]
     # 120 estimates: their scatter is known to 1/√240 of itself; three of those and a little.
     _assert_unbiased(draws, _expected_a(resting[0]), rel_of_std=0.25)
 
@@ -158,15 +189,16 @@ def test_the_lower_limit_is_below_the_noise_as_often_as_it_says(
     """The estimate itself is no bound: half of the draws are above the noise."""
     above: list[bool] = []
     above_limit: list[bool] = []
+    true_noise_a = _expected_a(resting[0])
     for seed in range(40):
-        datasets = _noisy(resting, seed)
-        floors = _all(noise_floors(datasets, CONDITIONING))
-        for floor, expected_a in zip(floors, _expected_a(resting[0]), strict=True):
+        floors = _at_rest(_noisy(resting, seed))
+        for floor, expected_a in zip(floors, true_noise_a, strict=True):
             above.append(floor.noise_a > expected_a)
             above_limit.append(floor.least_a > expected_a)
-            assert 0.7 * floor.noise_a < floor.least_a < floor.noise_a
-    draws = len(above)
-    assert 0.35 * draws < sum(above) < 0.65 * draws
+            smallest_a = 0.7 * floor.noise_a
+            assert smallest_a < floor.least_a < floor.noise_a
+    share_above = np.mean(above)
+    assert 0.35 < share_above < 0.65
     # Of 240 draws, 12 are expected above a limit of 95 %; 23 and more come in one of a thousand
     # such tests.
     assert 1 <= sum(above_limit) <= 22
@@ -185,8 +217,9 @@ def test_slips_in_some_dwells_do_not_become_the_noise(resting: tuple[Dataset, ..
                 middle = (dwell.start + dwell.stop) // 2
                 current_a[middle : dwell.stop, motor] += step_a
         slipping.append(replace(data, current_a=current_a))
-    floors = noise_floors(slipping, CONDITIONING)
-    for floor, expected_a in zip(_all(floors), _expected_a(resting[0]), strict=True):
+    floors = _at_rest(slipping)
+    true_noise_a = _expected_a(resting[0])
+    for floor, expected_a in zip(floors, true_noise_a, strict=True):
         assert floor.noise_a < 2.0 * expected_a
 
 
@@ -194,51 +227,63 @@ def test_what_moves_or_is_invalid_has_no_say(resting: tuple[Dataset, ...]) -> No
     noisy = _noisy(resting)
 
     def loud_in_motion(data: Dataset) -> Dataset:
-        current_a = np.where(data.motor_moving, 99.0 * data.current_a, data.current_a)
+        loud_a = 99.0 * data.current_a
+        current_a = np.where(data.motor_moving, loud_a, data.current_a)
         return replace(data, current_a=current_a)
 
     elsewhere = [loud_in_motion(data) for data in noisy]
     assert noise_floors(elsewhere, CONDITIONING) == noise_floors(noisy, CONDITIONING)
-    invalid = [replace(data, valid=np.zeros_like(data.valid)) for data in noisy]
-    assert noise_floors(invalid, CONDITIONING) == (None,) * 6
+    invalid = [_nowhere_valid(data) for data in noisy]
+    floors = noise_floors(invalid, CONDITIONING)
+    assert floors == (None,) * 6
 
 
 def test_too_few_dwells_report_nothing(resting: tuple[Dataset, ...]) -> None:
     first, *_ = _noisy(resting)
-    beginning = slice(0, round(6.0 * first.rate_hz))
+    samples = round(6.0 * first.rate_hz)
+    time_s = first.time_s[:samples]
+    current_a = first.current_a[:samples]
+    motor_moving = first.motor_moving[:samples]
+    valid = first.valid[:samples]
     short = replace(
         first,
-        time_s=first.time_s[beginning],
-        current_a=first.current_a[beginning],
-        motor_moving=first.motor_moving[beginning],
-        valid=first.valid[beginning],
+        time_s=time_s,
+        current_a=current_a,
+        motor_moving=motor_moving,
+        valid=valid,
     )
-    assert noise_floors((short,), CONDITIONING) == (None,) * 6
+    floors = noise_floors((short,), CONDITIONING)
+    assert floors == (None,) * 6
 
 
 def test_a_drive_that_reports_a_constant_reports_nothing(resting: tuple[Dataset, ...]) -> None:
-    switched_off = [replace(data, current_a=np.zeros_like(data.current_a)) for data in resting]
-    assert noise_floors(switched_off, CONDITIONING) == (None,) * 6
+    switched_off = []
+    for data in resting:
+        zeros = np.zeros_like(data.current_a)
+        switched_off.append(replace(data, current_a=zeros))
+    floors = noise_floors(switched_off, CONDITIONING)
+    assert floors == (None,) * 6
 
 
 def test_motors_that_never_rest_report_nothing(resting: tuple[Dataset, ...]) -> None:
-    always_moving = [
-        replace(data, motor_moving=np.ones_like(data.motor_moving)) for data in resting
-    ]
-    assert noise_floors(always_moving, CONDITIONING) == (None,) * 6
+    always_moving = []
+    for data in resting:
+        moving = np.ones_like(data.motor_moving)
+        always_moving.append(replace(data, motor_moving=moving))
+    floors = noise_floors(always_moving, CONDITIONING)
+    assert floors == (None,) * 6
 
 
 def test_an_axis_that_rests_throughout_a_run_counts_as_many_dwells(
     repeated: tuple[Dataset, ...],
 ) -> None:
     first = repeated[0]
-    still = replace(
-        first,
-        motor_moving=np.zeros_like(first.motor_moving),
-        current_a=np.zeros_like(first.current_a),
-    )
-    floors = noise_floors(_noisy([still]), SMALL)
-    for floor, expected_a in zip(_all(floors), _expected_a(still), strict=True):
+    motor_moving = np.zeros_like(first.motor_moving)
+    current_a = np.zeros_like(first.current_a)
+    still = replace(first, motor_moving=motor_moving, current_a=current_a)
+    floors = _of_small(_noisy([still]))
+    true_noise_a = _expected_a(still)
+    for floor, expected_a in zip(floors, true_noise_a, strict=True):
         assert floor.parts == 11
         assert _is_within_its_error(floor, expected_a)
 
@@ -250,11 +295,15 @@ def test_it_has_the_unit_of_the_current_and_no_offset(
     resting: tuple[Dataset, ...], factor: float, offset: float
 ) -> None:
     noisy = _noisy(resting[:2])
-    floors = _all(noise_floors(noisy, CONDITIONING))
-    scaled = [replace(data, current_a=factor * (data.current_a + offset)) for data in noisy]
-    scaled_floors = _all(noise_floors(scaled, CONDITIONING))
+    floors = _at_rest(noisy)
+    scaled = []
+    for data in noisy:
+        current_a = factor * (data.current_a + offset)
+        scaled.append(replace(data, current_a=current_a))
+    scaled_floors = _at_rest(scaled)
     for floor, scaled_floor in zip(floors, scaled_floors, strict=True):
-        assert scaled_floor.noise_a == pytest.approx(factor * floor.noise_a, rel=1e-6)
+        scaled_noise_a = factor * floor.noise_a
+        assert scaled_floor.noise_a == pytest.approx(scaled_noise_a, rel=1e-6)
         assert scaled_floor.parts == floor.parts
         assert scaled_floor.freedom == floor.freedom
 
@@ -265,10 +314,10 @@ def test_standstill_alone_is_no_bound(
     standstill = (FloorSource.STANDSTILL,)
     at_rest = _all(noise_floors(_noisy(resting), CONDITIONING, standstill))
     assert not any(floor.is_bound for floor in at_rest)
-    in_motion = _all(noise_floors(_noisy(repeated), SMALL, MOVES))
+    in_motion = _of_small(_noisy(repeated), MOVES)
     assert all(floor.is_bound for floor in in_motion)
     # Where standstill shows less than repeated moves, it is below the noise in motion as well.
-    of_both = _all(noise_floors(_noisy(repeated), SMALL))
+    of_both = _of_small(_noisy(repeated))
     assert all(floor.is_bound for floor in of_both)
 
 
@@ -277,7 +326,7 @@ def test_repeated_moves_recover_a_known_noise(repeated: tuple[Dataset, ...]) -> 
     """Torques of the motion cancel, ten times larger than the noise in a row;
     the start of a move is no sample.
     """
-    draws = [_all(noise_floors(_noisy(repeated, seed), SMALL, MOVES)) for seed in range(20)]
+    draws = [_of_small(_noisy(repeated, seed), MOVES) for seed in range(20)]
     for floor in draws[0]:
         assert floor.source is FloorSource.REPEATED_MOVES
         assert floor.parts > 30
@@ -288,11 +337,12 @@ def test_repeated_moves_recover_a_known_noise(repeated: tuple[Dataset, ...]) -> 
 def test_pairs_that_share_a_move_have_less_freedom(repeated: tuple[Dataset, ...]) -> None:
     """Three repetitions have 8/5 of the freedom of two, not twice (von Neumann et al. 1941)."""
     runs = _noisy((repeated[0],) * 3)
-    of_three = _all(noise_floors(runs, SMALL, MOVES))
-    of_two = _all(noise_floors(runs[:2], SMALL, MOVES))
+    of_three = _of_small(runs, MOVES)
+    of_two = _of_small(runs[:2], MOVES)
     for three, two in zip(of_three, of_two, strict=True):
         assert three.parts == 2 * two.parts
-        assert three.freedom == pytest.approx(8 / 5 * two.freedom)
+        freedom = 8 / 5 * two.freedom
+        assert three.freedom == pytest.approx(freedom)
 
 
 def test_friction_that_changes_between_repetitions_is_no_noise(
@@ -301,12 +351,14 @@ def test_friction_that_changes_between_repetitions_is_no_noise(
     noisy = _noisy(repeated)
     warming = []
     for number, data in enumerate(noisy):
-        friction_a = 5.0 * number * np.sign(data.velocity_rad_s)
-        warming.append(replace(data, current_a=data.current_a + friction_a))
-    floors = _all(noise_floors(noisy, SMALL, MOVES))
-    warming_floors = _all(noise_floors(warming, SMALL, MOVES))
+        direction = np.sign(data.velocity_rad_s)
+        friction_a = 5.0 * number * direction
+        warming.append(_with_current(data, friction_a))
+    floors = _of_small(noisy, MOVES)
+    warming_floors = _of_small(warming, MOVES)
     for floor, warming_floor in zip(floors, warming_floors, strict=True):
-        assert warming_floor.noise_a == pytest.approx(floor.noise_a, rel=1e-6)
+        same_noise = pytest.approx(floor.noise_a, rel=1e-6)
+        assert warming_floor.noise_a == same_noise
 
 
 def test_motion_that_a_disturbance_causes_is_no_noise(small_truth: Truth) -> None:
@@ -315,18 +367,17 @@ def test_motion_that_a_disturbance_causes_is_no_noise(small_truth: Truth) -> Non
     """
 
     def shaken(position: FloatArray, number: int) -> FloatArray:
-        phase = np.array([0.0, 1.0, 2.0]) + 2.5 * number
-        angle = 0.05 * np.arange(len(position))[:, None]
-        return np.asarray(position + 1e-3 * np.sin(angle + phase))
+        phase_of_axis = np.array([0.0, 1.0, 2.0]) + 2.5 * number
+        angle = 0.05 * np.arange(len(position))
+        shaking = np.sin(angle[:, None] + phase_of_axis)
+        return np.asarray(position + 1e-3 * shaking)
 
-    runs = _noisy(
-        [
-            _small_run(small_truth, 0, lambda position: shaken(position, 0)),
-            _small_run(small_truth, 1, lambda position: shaken(position, 1)),
-        ]
-    )
-    floors = noise_floors(runs, SMALL, MOVES)
-    for floor, expected_a in zip(_all(floors), _expected_a(runs[0]), strict=True):
+    first = _small_run(small_truth, 0, lambda position: shaken(position, 0))
+    second = _small_run(small_truth, 1, lambda position: shaken(position, 1))
+    runs = _noisy([first, second])
+    floors = _of_small(runs, MOVES)
+    true_noise_a = _expected_a(runs[0])
+    for floor, expected_a in zip(floors, true_noise_a, strict=True):
         assert _is_within_its_error(floor, expected_a)
 
 
@@ -339,16 +390,18 @@ def test_the_smaller_of_both_estimates_is_taken(
 ) -> None:
     """A robot that hunts at standstill, and one that is disturbed in motion."""
     rng = np.random.default_rng(2)
-    quiet_at_rest = [
-        replace(data, current_a=data.current_a * data.motor_moving) for data in repeated
-    ]
+    quiet_at_rest = []
+    for data in repeated:
+        current_a = data.current_a * data.motor_moving
+        quiet_at_rest.append(replace(data, current_a=current_a))
     runs = []
     for data in _noisy(quiet_at_rest):
         is_loud = data.motor_moving == loud_in_motion
-        loud_a = 3.0 * rng.standard_normal(data.current_a.shape) * is_loud
-        runs.append(replace(data, current_a=data.current_a + loud_a))
-    floors = noise_floors(runs, SMALL)
-    for floor, expected_a in zip(_all(floors), _expected_a(runs[0]), strict=True):
+        disturbance_a = 3.0 * rng.standard_normal(data.current_a.shape)
+        runs.append(_with_current(data, disturbance_a * is_loud))
+    floors = _of_small(runs)
+    true_noise_a = _expected_a(runs[0])
+    for floor, expected_a in zip(floors, true_noise_a, strict=True):
         assert floor.source is source
         assert _is_within_its_error(floor, expected_a)
 
@@ -356,15 +409,16 @@ def test_the_smaller_of_both_estimates_is_taken(
 def test_other_paths_payloads_and_rates_are_no_repetition(repeated: tuple[Dataset, ...]) -> None:
     first, second, _ = _noisy(repeated)
     one_percent_of_travel = np.array([0.05, 0.0, 0.0])
-    others = (
-        replace(second, position_rad=second.position_rad + one_percent_of_travel),
-        replace(second, payload=MOUNTED),
-        replace(second, rate_hz=1.01 * second.rate_hz),
-        replace(second, valid=np.zeros_like(second.valid)),
-        first,  # one run given twice
-    )
-    for other in others:
-        assert noise_floors((first, other), SMALL, MOVES) == (None,) * 3
+    position_rad = second.position_rad + one_percent_of_travel
+    other_path = replace(second, position_rad=position_rad)
+    other_payload = replace(second, payload=MOUNTED)
+    rate_hz = 1.01 * second.rate_hz
+    other_rate = replace(second, rate_hz=rate_hz)
+    invalid = _nowhere_valid(second)
+    given_twice = first
+    for other in (other_path, other_payload, other_rate, invalid, given_twice):
+        floors = noise_floors((first, other), SMALL, MOVES)
+        assert floors == (None,) * 3
 
 
 def test_a_floor_far_above_the_error_of_a_model_is_refuted() -> None:

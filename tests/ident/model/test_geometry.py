@@ -43,12 +43,26 @@ def _torque_slope(
 ) -> FloatArray:
     """Change of the axes' torques per unit of a zero or a length, shape (m, k)."""
     step = STEP * unit_of(model, parameter)
-    torques = []
-    for change in (step, -step):
-        changed = model_with_geometry(model, (GeometryChange(parameter, change),))
-        torques.append(changed.torques(motion, standard)[2])
-    ahead, behind = torques
-    return np.asarray((ahead - behind) / (2.0 * step))
+    ahead = _torque(_changed(model, parameter, step), motion, standard)
+    behind = _torque(_changed(model, parameter, -step), motion, standard)
+    difference = ahead - behind
+    return difference / (2.0 * step)
+
+
+def _changed(model: Model, parameter: GeometryParameter, change: float) -> Model:
+    return model_with_geometry(model, (GeometryChange(parameter, change),))
+
+
+def _torque(model: Model, motion: Motion, standard: FloatArray) -> FloatArray:
+    """Torques of the axes, shape (m, k)."""
+    torques = model.torques(motion, standard)
+    return np.asarray(torques[2])
+
+
+def _home_rad(model: Model) -> FloatArray:
+    """Positions of the axes in which the robot is assembled."""
+    axis_joints = list(model.robot.axis_joints)
+    return np.asarray(model.assembly.position_rad[axis_joints])
 
 
 def test_parameters_are_the_zeros_of_motors_and_the_lengths_of_moving_links() -> None:
@@ -72,34 +86,39 @@ def test_a_zero_is_added_to_the_recorded_positions(mechanism: Mechanism) -> None
         change = GeometryChange(geometry_parameters(robot)[axis], 0.01)
         shifted = home.copy()
         shifted[joint] += 0.01
-        found = poses(with_geometry(robot, (change,)), home[None])
+        changed = with_geometry(robot, (change,))
+        found = poses(changed, home[None])
         expected = poses(robot, shifted[None])
-        assert_allclose(found.origin_m[joint + 2 :], expected.origin_m[joint + 2 :], atol=1e-12)
+        behind = joint + 2
+        found_origins_m = found.origin_m[behind:]
+        expected_origins_m = expected.origin_m[behind:]
+        assert_allclose(found_origins_m, expected_origins_m, atol=1e-12)
         assert_allclose(found.rotation, expected.rotation, atol=1e-12)
 
 
 @pytest.mark.slow
 def test_a_length_moves_the_other_end_of_its_link_along_itself() -> None:
-    for parameter in geometry_parameters(PLANAR.robot):
-        if parameter.kind is GeometryKind.LENGTH:
-            before = described_length(PLANAR.robot, parameter)
-            longer = with_geometry(PLANAR.robot, (GeometryChange(parameter, 3e-4),))
-            assert described_length(longer, parameter) == pytest.approx(before + 3e-4)
-            others = [
-                one
-                for one in geometry_parameters(PLANAR.robot)
-                if one.kind is parameter.kind and one != parameter
-            ]
-            assert all(
-                described_length(longer, one) == described_length(PLANAR.robot, one)
-                for one in others
-            )
+    robot = PLANAR.robot
+    parameters = geometry_parameters(robot)
+    lengths = [one for one in parameters if one.kind is GeometryKind.LENGTH]
+    before_m = {length: described_length(robot, length) for length in lengths}
+    for length in lengths:
+        change = GeometryChange(length, 3e-4)
+        longer = with_geometry(robot, (change,))
+        for one in lengths:
+            found_m = described_length(longer, one)
+            if one == length:
+                longer_m = before_m[one] + 3e-4
+                assert found_m == pytest.approx(longer_m)
+            else:
+                assert found_m == before_m[one]
 
 
 def test_an_unknown_length_is_refused_with_those_that_there_are() -> None:
     unknown = GeometryParameter(GeometryKind.LENGTH, "left-crank", "right-rod")
+    change = GeometryChange(unknown, 1e-3)
     with pytest.raises(ModelError, match="length from left-crank to left-rod"):
-        with_geometry(FIVE_BAR.robot, (GeometryChange(unknown, 1e-3),))
+        with_geometry(FIVE_BAR.robot, (change,))
     with pytest.raises(ModelError, match="no length from left-crank to right-rod"):
         described_length(FIVE_BAR.robot, unknown)
 
@@ -108,7 +127,15 @@ def test_an_unknown_length_is_refused_with_those_that_there_are() -> None:
 
 
 def _model(spec: CellSpec) -> Model:
-    pairs = [LinkPair(one.name, one.first, one.second, one.directions) for one in spec.closures]
+    pairs = []
+    for closure in spec.closures:
+        pair = LinkPair(
+            closure.name,
+            closure.first,
+            closure.second,
+            closure.directions,
+        )
+        pairs.append(pair)
     assembly_rad = dict(spec.assembly_rad)
     robot = robot_from_urdf(
         spec.urdf,
@@ -129,24 +156,24 @@ def _standard(model: Model, spec: CellSpec) -> FloatArray:
     tree = link_model(changed_spec)
     standard = np.zeros(len(model.columns))
     for joint, columns in zip(model.robot.joints, model.link_columns, strict=True):
-        m, mx, my, mz, xx, xy, yy, xz, yz, zz = tree.inertias[
-            tree.getJointId(joint.name)
-        ].toDynamicParameters()
+        joint_id = tree.getJointId(joint.name)
+        inertia = tree.inertias[joint_id]
+        m, mx, my, mz, xx, xy, yy, xz, yz, zz = inertia.toDynamicParameters()
         standard[columns] = xx, xy, xz, yy, yz, zz, mx, my, mz, m
     return standard
 
 
 def _axes_motion(model: Model, samples: int) -> Motion:
-    grid = np.linspace(0.0, 1.0, samples)
-    t = grid[:, None]
-    axis_joints = list(model.robot.axis_joints)
-    home = model.assembly.position_rad[axis_joints]
-    wave = 2.0 * np.pi * np.array([0.7, 1.1])
-    position = home + 0.25 * np.sin(wave * t + [0.0, 1.0])
-    acceleration_rad_s2 = -0.25 * wave**2 * np.sin(wave * t + [0.0, 1.0])
-    velocity_rad_s = 0.25 * wave * np.cos(wave * t + [0.0, 1.0])
+    time_s = np.linspace(0.0, 1.0, samples)
+    frequency_hz = np.array([0.7, 1.1])
+    wave = 2.0 * np.pi * frequency_hz
+    phase = wave * time_s[:, None] + [0.0, 1.0]
+    swing_rad = 0.25 * np.sin(phase)
+    position_rad = _home_rad(model) + swing_rad
+    velocity_rad_s = 0.25 * wave * np.cos(phase)
+    acceleration_rad_s2 = -(wave**2) * swing_rad
     return Motion(
-        position,
+        position_rad,
         velocity_rad_s,
         acceleration_rad_s2,
     )
@@ -163,28 +190,48 @@ def _simulated_torque(spec: CellSpec, motion: Motion, zero_rad: FloatArray) -> F
     motors = len(spec.motors)
     torques = []
     position = mechanism.start_rad
+    order = mechanism.order
     for sample in range(len(motion.position_rad)):
+        start_rad = motion.position_rad[sample] + zero_rad
+        speed_rad_s = motion.velocity_rad_s[sample]
+        acceleration_rad_s2 = motion.acceleration_rad_s2[sample]
         states = []
         for step in (-STEP_S, 0.0, STEP_S):
+            by_speed = step * speed_rad_s
+            by_acceleration = 0.5 * step**2 * acceleration_rad_s2
             rough = position.copy()
-            rough[:motors] = (
-                motion.position_rad[sample]
-                + zero_rad
-                + step * motion.velocity_rad_s[sample]
-                + 0.5 * step**2 * motion.acceleration_rad_s2[sample]
-            )
-            states.append(mechanism.closed(rough, (motors,)))
+            rough[:motors] = start_rad + by_speed + by_acceleration
+            closed = mechanism.closed(rough, (motors,))
+            states.append(closed)
         before, position, after = states
         velocity = (after - before) / (2.0 * STEP_S)
-        acceleration = (after - 2.0 * position + before) / STEP_S**2
-        q, v, a = (np.empty(tree.nv) for _ in range(3))
-        for target, source in ((q, position), (v, velocity), (a, acceleration)):
-            target[mechanism.order] = source
-        of_tree = pin.rnea(tree, data, q, v, a)[mechanism.order]
+        second_difference = after - 2.0 * position + before
+        acceleration = second_difference / STEP_S**2
+        q = np.empty(tree.nv)
+        v = np.empty(tree.nv)
+        a = np.empty(tree.nv)
+        q[order] = position
+        v[order] = velocity
+        a[order] = acceleration
+        of_tree = pin.rnea(tree, data, q, v, a)[order]
         jacobian = mechanism.at(position)[1]
-        passive = -np.linalg.solve(jacobian[:, motors:], jacobian[:, :motors])
-        torques.append(of_tree[:motors] + passive.T @ of_tree[motors:])
+        of_motors = jacobian[:, :motors]
+        of_passive = jacobian[:, motors:]
+        passive = -np.linalg.solve(of_passive, of_motors)
+        torque = of_tree[:motors] + passive.T @ of_tree[motors:]
+        torques.append(torque)
     return np.array(torques).T
+
+
+def _with_length(spec: CellSpec, joint: str, before_m: float, after_m: float) -> CellSpec:
+    """The cell with another place of a joint on its link."""
+    described = f'xyz="{before_m:g} 0 0"'
+    changed = f'xyz="{after_m!r} 0 0"'
+    head, name, tail = spec.urdf.partition(f'name="{joint}"')
+    assert described in tail
+    changed_tail = tail.replace(described, changed, 1)
+    urdf = head + name + changed_tail
+    return replace(spec, urdf=urdf)
 
 
 def test_the_derivative_of_the_torques_is_that_of_the_simulated_five_bar() -> None:
@@ -193,44 +240,33 @@ def test_the_derivative_of_the_torques_is_that_of_the_simulated_five_bar() -> No
     standard = _standard(model, spec)
     motion = _axes_motion(model, 12)
     no_zero = np.zeros(2)
-    whole = model.torques(motion, standard)[2]
-    assert_allclose(
-        whole, _simulated_torque(spec, motion, no_zero), atol=1e-4 * np.abs(whole).max()
-    )
+    torque = _torque(model, motion, standard)
+    simulated = _simulated_torque(spec, motion, no_zero)
+    largest = np.abs(torque).max()
+    assert_allclose(torque, simulated, atol=1e-4 * largest)
+
     step = 1e-3
-    crank = next(joint for joint in model.robot.joints if joint.parent >= 0)
-    driven = model.robot.joints[crank.parent].name
+    joints = model.robot.joints
+    (crank, *_) = [joint for joint in joints if joint.parent >= 0]
+    driven = joints[crank.parent].name
     length_m = float(np.linalg.norm(crank.translation_m))
-    described = f'xyz="{length_m:g} 0 0"'
-    before, _, after = spec.urdf.partition(f'name="{crank.name}"')
-    assert described in after
-    changed_after = after.replace(described, f'xyz="{length_m + step!r} 0 0"', 1)
-    changed_after_urdf = f'{before}name="{crank.name}"' + changed_after
-    longer = replace(
-        spec,
-        urdf=changed_after_urdf,
-    )
-    urdf = f'{before}name="{crank.name}"' + after.replace(
-        described, f'xyz="{length_m - step!r} 0 0"', 1
-    )
-    shorter = replace(
-        spec,
-        urdf=urdf,
-    )
-    by_length = _simulated_torque(longer, motion, no_zero) - _simulated_torque(
-        shorter, motion, no_zero
-    )
+    longer = _with_length(spec, crank.name, length_m, length_m + step)
+    shorter = _with_length(spec, crank.name, length_m, length_m - step)
+    torque_longer = _simulated_torque(longer, motion, no_zero)
+    torque_shorter = _simulated_torque(shorter, motion, no_zero)
+    length = GeometryParameter(GeometryKind.LENGTH, driven, crank.name)
+
     turned = np.array([step, 0.0])
-    by_zero = _simulated_torque(spec, motion, turned) - _simulated_torque(spec, motion, -turned)
-    geometry_parameter = GeometryParameter(GeometryKind.ZERO, model.robot.axes[0].name)
-    for parameter, change in (
-        (GeometryParameter(GeometryKind.LENGTH, driven, crank.name), by_length),
-        (geometry_parameter, by_zero),
-    ):
+    torque_ahead = _simulated_torque(spec, motion, turned)
+    torque_behind = _simulated_torque(spec, motion, -turned)
+    zero = GeometryParameter(GeometryKind.ZERO, model.robot.axes[0].name)
+
+    changes = {length: torque_longer - torque_shorter, zero: torque_ahead - torque_behind}
+    for parameter, change in changes.items():
         expected = change / (2.0 * step)
         found = _torque_slope(model, motion, standard, parameter)
-        largest_absolute_expected = np.abs(expected).max()
-        assert_allclose(found, expected, atol=2e-3 * largest_absolute_expected)
+        largest = np.abs(expected).max()
+        assert_allclose(found, expected, atol=2e-3 * largest)
 
 
 @pytest.mark.slow
@@ -239,18 +275,19 @@ def test_the_torque_beside_a_redundant_robot_is_the_derivative_times_the_change(
     model = PLANAR.model
     rng = np.random.default_rng(3)
     standard = rng.uniform(0.1, 1.0, len(model.columns))
-    axis_joints = list(model.robot.axis_joints)
-    home = model.assembly.position_rad[axis_joints]
+    home = _home_rad(model)
     still = np.zeros((1, 4))
     acceleration_rad_s2 = still + 1.0
     motion = Motion(home[None], still, acceleration_rad_s2)
-    described = model.torques(motion, standard)[2]
+    described = _torque(model, motion, standard)
     for parameter in geometry_parameters(model.robot)[1::4]:
         slope = _torque_slope(model, motion, standard, parameter)
         left = []
         for change in (2e-3, 1e-3):
-            beside = model_with_geometry(model, (GeometryChange(parameter, change),))
-            difference = beside.torques(motion, standard)[2] - described
-            difference_norm = np.linalg.norm(difference - change * slope)
-            left.append(difference_norm)
-        assert 3.5 < left[0] / left[1] < 4.5
+            changed = _torque(_changed(model, parameter, change), motion, standard)
+            by_derivative = change * slope
+            rest = changed - described - by_derivative
+            left.append(np.linalg.norm(rest))
+        of_change, of_half = left
+        ratio = of_change / of_half
+        assert 3.5 < ratio < 4.5
