@@ -558,9 +558,9 @@ def test_a_zero_that_the_search_has_set_aside_is_named_and_one_in_its_noise_is_n
     assert description_diagnoses(after_search) == ()
 
     # One that may be zero as it was found asks for no correction of the cell file.
-    uncertain = passed_finding(ZeroOffset(), 1, 1.5 * std, std)
-    aside = SetAside(uncertain, "in the joint fit it no longer passes")
-    not_significant = replace(step, set_aside=(aside,))
+    uncertain = passed_finding(ZeroOffset(), 1, 1.5 * std_rad, std_rad)
+    rejected = SetAside(uncertain, "in the joint fit it no longer passes")
+    not_significant = replace(step, set_aside=(rejected,))
     assert description_diagnoses(replace(fitted, steps=(not_significant,))) == ()
 
 
