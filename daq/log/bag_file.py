@@ -148,15 +148,25 @@ def open_bag(path: Path) -> Iterator[McapBag | SqliteBag | Ros1Bag]:
     a file that cannot be read is reported with its messages.
 
     Raises:
-        LogCorrupt: it is packed, and unfolds to more than a recording.
+        LogCorrupt: it is empty; or it is packed, and unfolds to nothing, or to more than a
+            recording.
         OutputFailed: there is no room for what it unfolds to.
     """
+    if path.is_file() and path.stat().st_size == 0:
+        raise LogCorrupt(
+            str(path),
+            found="an empty file",
+            expected="a recording",
+            remedy="copy it again from where it was recorded, or record again",
+        )
     if not first_bytes(path).startswith(ZSTD_MAGIC):
         yield _bag(path, path)
         return
     with TemporaryDirectory() as folder:
         source = Path(folder) / "bag"
         _unpack_file(path, source)
+        if source.stat().st_size == 0:
+            raise _packed_wrong(path, "a file that unfolds to nothing: it was cut")
         yield _bag(path, source)
 
 

@@ -24,6 +24,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from daq.cli import main
 from daq.errors import DataError, ExitCode, LogCorrupt, LogTruncated, TableUnfit
+from daq.log.bag_file import open_bag
 from daq.log.importing import reader_of
 from daq.log.mcap_bag import unpack_message
 from daq.log.message import JOINTS_SCHEMA
@@ -243,6 +244,31 @@ def test_a_packed_file_that_is_damaged_is_named(
     with pytest.raises(DataError) as caught:
         read(path)
     assert str(caught.value).startswith(str(path))
+
+
+@pytest.mark.parametrize("name", ["bag.db3", "bag.mcap", "bag.bag", "bag.mcap.zstd"])
+def test_an_empty_file_is_called_that(tmp_path: Path, name: str) -> None:
+    path = tmp_path / name
+    path.touch()
+    with (
+        pytest.raises(LogCorrupt, match=f"{name}: found an empty file; expected a recording"),
+        open_bag(path),
+    ):
+        pass
+
+
+@pytest.mark.parametrize("length", [4, 8, 12])
+def test_a_packed_file_that_was_cut_before_its_first_block_is_called_that(
+    tmp_path: Path, length: int
+) -> None:
+    packed = zstandard.ZstdCompressor().compress(b"x" * 1000)
+    path = tmp_path / "bag.mcap.zstd"
+    path.write_bytes(packed[:length])
+    with (
+        pytest.raises(LogCorrupt, match="found a file that unfolds to nothing: it was cut"),
+        open_bag(path),
+    ):
+        pass
 
 
 def test_no_room_for_what_a_file_unfolds_to_is_an_error(
