@@ -10,6 +10,7 @@ import grp
 import hashlib
 import os
 import pwd
+import re
 import stat
 import struct
 import sys
@@ -368,6 +369,21 @@ def _check(found: os.stat_result, path: Path) -> None:
         raise IsADirectoryError(errno.EISDIR, "is a directory", str(path))
     if not stat.S_ISREG(found.st_mode):
         raise OSError(errno.EINVAL, "something that is no regular file", str(path))
+
+
+def target_of_copy(copy: Path) -> str | None:
+    """Return the name of the file that an unfinished copy is of; None for any other file.
+
+    `replace_file` leaves such a copy only if it is killed.
+    """
+    match = _COPY_NAME.fullmatch(copy.name)
+    if match is None:
+        return None
+    return match["target"]
+
+
+_COPY_NAME = re.compile(r"\.(?P<target>.+)\.[0-9]+-[0-9]+\.tmp")
+"""Names that `_new_file` gives."""
 
 
 def _new_file(target: Path, mode: int) -> tuple[Path, int]:

@@ -173,6 +173,8 @@ def history_verb(
         # some.
         resolve_links(declared.controller_path)
     console = output_console()
+    # Before a rename is made, the new name has no entries yet.
+    is_known_to_be_empty = not history.may_lack and rename is None
     if json:
         print_json(history_report(declared.name, history, chosen, all_series, current, checked))
     else:
@@ -181,8 +183,7 @@ def history_verb(
             say_verification(checked, console)
         elif axis is not None:
             show_axis(chosen[0], all_series, actions, console)
-        elif history.entries or not (history.may_lack or rename):
-            # Before a rename is made, the new name has no history yet.
+        elif history.entries or is_known_to_be_empty:
             show_history(history.entries, all_series, actions, console)
         say_written(console, plot, csv)
     if checked is not None:

@@ -261,28 +261,34 @@ def nodes_on_buses(options: Sequence[str], node_ids: Sequence[int]) -> dict[str,
 def how_to_reach(parts: Sequence[BusPart], period_us: int) -> str:
     """Return the settings for the cell file, ready to paste, and a first command to try."""
     # A kernel's bus carries frames in their own time; over a hub the simulated cell sets the pace.
-    pacing = "lockstep" if parts[0].address.kind.is_simulated else "timed"
-    several = len(parts) > 1
+    pacing = "timed"
+    if parts[0].address.kind.is_simulated:
+        pacing = "lockstep"
+    has_several_buses = len(parts) > 1
     buses = ""
+    nodes = ""
     for part in parts:
         address = part.address
-        indent = "    " if several else "  "
         keys = {"interface": address.interface, "channel": address.channel}
         if address.kind.has_server:
-            keys |= {"host": address.host, "port": str(address.port)}
+            keys["host"] = address.host
+            keys["port"] = str(address.port)
         keys["bitrate_bit_s"] = str(address.bitrate_bit_s)
-        buses += f"  - name: {part.name}\n" if several else ""
-        buses += "".join(f"{indent}{key}: {value}\n" for key, value in keys.items())
-    nodes = "".join(
-        f"axes with node_id {', '.join(map(str, sorted(part.node_ids)))}: add bus: {part.name}\n"
-        for part in parts
-    )
+        indent = "  "
+        if has_several_buses:
+            indent = "    "
+            buses += f"  - name: {part.name}\n"
+            node_ids = ", ".join(map(str, sorted(part.node_ids)))
+            nodes += f"axes with node_id {node_ids}: add bus: {part.name}\n"
+        for key, value in keys.items():
+            buses += f"{indent}{key}: {value}\n"
+    if nodes:
+        nodes = f"{nodes}\n"
     return (
         "A cell of `drivegain init --simulated` reaches it as it is. In another cell file, replace "
         "`bus` and `sync` with:\n\n"
         f"bus:\n{buses}sync:\n  period_us: {period_us}\n  pacing: {pacing}\n\n"
-        + (f"{nodes}\n" if several else "")
-        + "and try it in a second terminal: drivegain scan CELL"
+        f"{nodes}and try it in a second terminal: drivegain scan CELL"
     )
 
 

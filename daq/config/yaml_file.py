@@ -48,7 +48,7 @@ MAX_BITS = 64  #: Longest integer: no object of an amplifier is longer
 MAX_EXPLAINED = 100
 MAX_SHOWN = 8  #: Faults listed in one message
 _NOT_IN_FILE = "\0"
-#: Characters that YAML 1.1 takes for the end of a line, and that editors show as nothing
+#: Characters that end a line in YAML 1.1, and that editors do not show
 _HIDDEN_LINE_END = re.compile("[\u0085\u2028\u2029]")
 
 PATTERNS = {
@@ -271,8 +271,8 @@ def parse_yaml(text: bytes, name: str) -> Document:
             remedy = "remove this line and what is below it, or give that a file of its own"
         hidden = _HIDDEN_LINE_END.search(text.decode("utf-8", errors="replace"))
         if hidden is not None:
-            found = f"{found}; the file has a character that ends a line and is not to be seen, "
-            found += f"U+{ord(hidden[0]):04X}"
+            code_point = f"U+{ord(hidden[0]):04X}"
+            found = f"{found}; the file has an invisible character that ends a line, {code_point}"
             remedy = "remove that character: it comes with text from a page or a document"
         raise YamlInvalid(
             f"{name}:{line}", found=found, expected="one YAML document", remedy=remedy

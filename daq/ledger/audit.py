@@ -743,6 +743,20 @@ def open_writes(
             )
 
 
+def unmade_write(verdict: AuditVerdict, subject: str) -> AuditEntry | None:
+    """Return the last write to a file or to drives where it was begun and not made; else None.
+
+    Args:
+        verdict: of `verify`, which has read the file.
+        subject: as the audit log names it.
+    """
+    begun = [one for one in verdict.entries if one.action in _BEGUN and one.subject == subject]
+    unmade = [one.begun for one in verdict.open_writes if one.content is Content.BEFORE]
+    if begun and begun[-1] in unmade:
+        return begun[-1]
+    return None
+
+
 def begun_by(entry: AuditEntry) -> int:
     """Return the number of the entry that began the write, 0 where there is none."""
     found = entry.details.get("begun")

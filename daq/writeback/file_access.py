@@ -26,7 +26,7 @@ from daq.errors import (
     WriteUnconfirmed,
     reason_of,
 )
-from daq.files import follow_links, hold_lock, open_folder, replace_file
+from daq.files import follow_links, hold_lock, open_folder, replace_file, target_of_copy
 from daq.formats.document import read_controller_file
 from daq.writeback.request import short_digest
 
@@ -140,15 +140,17 @@ def exclusive_writer(target: Path) -> Iterator[None]:
 
 
 def _remove_unfinished(target: Path) -> None:
-    """Remove unfinished copies of a file and of its backups, as `replace_file` names them.
+    """Remove unfinished copies of a file and of its backups.
 
     The caller has the lock, so no writer works on them.
     """
-    file_name = re.escape(target.name)
-    copy_name = re.compile(rf"\.{file_name}(\..*\.bak)?\.\d+-\d+\.tmp")
+    backup_name = _backup_name(target)
     with contextlib.suppress(OSError):
         for path in target.parent.iterdir():
-            if copy_name.fullmatch(path.name):
+            name = target_of_copy(path)
+            if name is None:
+                continue
+            if name == target.name or backup_name.fullmatch(name):
                 path.unlink(missing_ok=True)
 
 
@@ -183,8 +185,7 @@ class Backup:
 
 def backups(target: Path) -> tuple[Backup, ...]:
     """Return the backups next to a controller file, oldest first."""
-    file_name = re.escape(target.name)
-    backup_name = re.compile(file_name + _AFTER_FILE_NAME)
+    backup_name = _backup_name(target)
     found = []
     for path in target.parent.iterdir():
         match = backup_name.fullmatch(path.name)
@@ -200,6 +201,12 @@ def backups(target: Path) -> tuple[Backup, ...]:
         found.append(backup)
     found.sort(key=lambda backup: (backup.stamp, backup.count))
     return tuple(found)
+
+
+def _backup_name(target: Path) -> re.Pattern[str]:
+    """Return the pattern of the names of a file's backups."""
+    file_name = re.escape(target.name)
+    return re.compile(file_name + _AFTER_FILE_NAME)
 
 
 _AFTER_FILE_NAME = (

@@ -42,8 +42,8 @@ from daq.ledger.audit import (
     GONE,
     AuditAction,
     AuditEntry,
-    Content,
     digest_now,
+    unmade_write,
     verify,
 )
 from daq.ledger.fold import WriteAction
@@ -296,7 +296,7 @@ def rollback(
 
     Raises:
         UsageError: an argument is of another type; nothing was written.
-        CalibrationRefused: see `Target.plan_rollback`; or the last write was begun and never made.
+        CalibrationRefused: see `Target.plan_rollback`; or the last write was begun and not made.
         CalibrationRefused, DriverError, OSError: see `Target.lock` and `Target.write`.
         AuditUnusable: the beginning could not be recorded; nothing was written.
     """
@@ -344,7 +344,7 @@ def _write(
         with recorder.refusals(refused_details):
             lock.enter_context(target.lock(edit))
             if begun_action is AuditAction.ROLLBACK_BEGUN:
-                # Under the lock: a write that still goes on is no write that was never made.
+                # Under the lock, so that a write that still goes on is not taken for one.
                 _require_made_write(recorder)
         digest_before = None if edit.before is None else sha256(edit.before)
         digest_after = sha256(edit.after)
@@ -384,15 +384,14 @@ def _write(
 
 
 def _require_made_write(recorder: _Recorder) -> None:
-    """Refuse to take back more than the last write where that was begun and never made.
+    """Refuse a rollback where the last write is an `apply` that was begun and not made.
 
-    The file is as it was before the write that its operator wants to undo; a rollback would undo
-    the write before that. A rollback that was begun and never made is made now.
-
-    An audit log that cannot be read tells of none; what follows refuses it by name.
+    The file is as it was before that write; a rollback would undo the write before it. A rollback
+    that was begun and not made is no reason to refuse: this one makes it. An audit log that cannot
+    be read shows neither; the entry that follows refuses it by name.
 
     Raises:
-        CalibrationRefused: the last write is an `apply` that was never made.
+        CalibrationRefused: the last write was not made.
     """
     if recorder.audit is None:
         return
@@ -400,23 +399,17 @@ def _require_made_write(recorder: _Recorder) -> None:
         verdict = verify(recorder.audit)
     except (AuditUnusable, OSError):
         return
-    begun = [
-        one
-        for one in verdict.entries
-        if one.action in _BEGINNINGS and one.subject == recorder.subject
-    ]
-    unmade = [one.begun for one in verdict.open_writes if one.content is Content.BEFORE]
-    if not begun or begun[-1] not in unmade or begun[-1].action is not AuditAction.APPLY_BEGUN:
+    last = unmade_write(verdict, recorder.subject)
+    if last is None or last.action is not AuditAction.APPLY_BEGUN:
         return
-    last = begun[-1]
+    backup_name = f"{Path(recorder.subject).name}.<time>.<digests>.bak"
     raise CalibrationRefused(
         recorder.subject,
-        found=f"a last write, begun by {last.who} at {last.at}, that was never made: its program "
-        "was ended before",
+        found=f"a last write, begun by {last.who} at {last.at}, that was not made",
         expected="a write to take back",
-        remedy="nothing was changed, and nothing is to be undone: the file is as it was before "
+        remedy="nothing was changed, and nothing needs to be undone: the file is as it was before "
         "that write; to take back the write before it all the same, copy its backup "
-        f"({Path(recorder.subject).name}.<time>.<digests>.bak) over the file",
+        f"({backup_name}) over the file",
     )
 
 
@@ -485,7 +478,6 @@ def _complete_history(proposal: Proposal[E], recorder: _Recorder) -> str:
     return ""
 
 
-_BEGINNINGS = frozenset({AuditAction.APPLY_BEGUN, AuditAction.ROLLBACK_BEGUN})
 _IN_PLACE = "{} has the new content, complete; the history lacks this write"
 
 

@@ -299,6 +299,9 @@ def find_turned_geometry(
     Returns:
         the hypothesis with the largest fall of the errors; None where the declared geometry is as
         good as any.
+
+    Raises:
+        ModelError: an argument is of another type or shape, or a gain is zero.
     """
     require_entries("instants", instants, Instants, "give `Identification.instants`")
     for of_run in instants:

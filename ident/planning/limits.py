@@ -101,7 +101,8 @@ class JointLimits:
         """Refuse limits that are not those of so many joints.
 
         Raises:
-            ModelError: a limit has another shape, is no finite number, or leaves no room.
+            ModelError: a limit has another shape, is no finite number or one that no robot has, or
+                leaves no room.
         """
         lower = as_array("limits.lower", self.lower, (count,), "one per joint")
         upper = as_array("limits.upper", self.upper, (count,), "one per joint")

@@ -1,7 +1,7 @@
 """Figures in the text of evidence pages are those of the data beside them.
 
-A study writes its tables. The sentences about them are written by hand, and were out of date more
-than once: whoever replaces a table is told here which sentence to correct.
+A study writes its tables; the sentences about them are written by hand. After a table is replaced,
+these tests name the sentence to correct.
 """
 
 from __future__ import annotations

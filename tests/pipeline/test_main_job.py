@@ -26,6 +26,7 @@ from daq.report.job_schemas import DemoReport
 from ident.errors import RolesExchanged
 from ident.estimators.identify import identify
 from ident.estimators.refusals import require_roles
+from tests.daq.documents.test_calibration_file import FIT_KEYS, GAIN_KEYS, PARAMETER_KEYS
 from tests.pipeline.next_step import next_step
 
 
@@ -118,27 +119,6 @@ def test_the_pictures_are_there(demonstration: Path) -> None:
     files = chain(demonstration.glob("*.png"), demonstration.glob("*.svg"))
     pictures = {path.name for path in files}
     assert pictures == {"torques.svg", "gains.png", "residual-J3-load-friction.svg"}
-
-
-FIT_KEYS = {
-    "method",
-    "gains",
-    "parameters",
-    "relative_error_percent",
-    "condition",
-    "rows",
-    "filter",
-    "effects",
-}
-GAIN_KEYS = {
-    "axis",
-    "value",
-    "std_percent",
-    "unit",
-    "nameplate",
-    "change_percent",
-}
-PARAMETER_KEYS = {"name", "value", "unit", "std_percent"}
 
 
 def test_a_log_is_enough_to_identify_from(

@@ -481,7 +481,7 @@ def test_a_write_that_was_never_made_is_not_rolled_back_in_the_place_of_another(
     for _ in range(2 if is_tried_again else 1):
         with pytest.raises(
             CalibrationRefused,
-            match=r"begun by bert at 2025-.*, that was never made.*nothing is to be undone",
+            match=r"begun by bert at 2025-.*, that was not made.*nothing needs to be undone",
         ):
             rollback(FileTarget(controller), NOW, audit=audit, who="bert")
     assert controller.read_bytes() == before

@@ -37,7 +37,7 @@ BOUNDS = MotionBounds(
     standstill_cycles=5,
 )
 NO_POWER = (0x40, 0x08, 0x28)
-"""States that are told by bits 0 to 3, 5 and 6 of the statusword."""
+"""Bits 0 to 3, 5 and 6 of the statusword in the states without power."""
 MARKS = (EventKind.MOVE_START, EventKind.MOVE_END)
 FAR = Move((50_000, -40_000), (100_000, 80_000), (1_000_000, 800_000))
 

@@ -82,7 +82,7 @@ MISTAKES = (WRONG_ZERO, LATE_POSITION, LEANING_BASE)
 CLEAN = Mistake("nothing", 0, ())
 
 PAYLOADS = (None, MOUNTED, None, MOUNTED)
-"""Of four runs."""
+"""Payload of each of four runs; None without load."""
 
 
 def _declared(mistake: Mistake) -> Truth:

@@ -38,7 +38,7 @@ FloatArray = NDArray[np.float64]
 
 
 LIMITS = [[0.1], [1.5], [2.0], [6.0]]
-"""Of the random motions: one row for each derivative of the position."""
+"""Largest position and derivatives of the random motions, a row each."""
 
 
 def _model(
