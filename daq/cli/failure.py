@@ -75,7 +75,7 @@ ADVICE: dict[type[Exception], tuple[str, str]] = {
         "nothing else was changed; check write protection and the drive's manual",
     ),
     driver.DriveFault: (
-        "no fault while the axes move",
+        "axes without a fault from the first SYNC to the last",
         "remove the cause (`drivegain explain-emcy CODE` explains a code), then `drivegain scan "
         "CELL --reset-faults`",
     ),

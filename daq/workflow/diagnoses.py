@@ -607,7 +607,7 @@ OR_A_LENGTH = (
     "one looks like this"
 )
 SMALL_DELAY = "tenths of a millisecond are a filter of the drive, several milliseconds are a fault"
-INTO_THE_MODEL = "`drivegain residual` takes the delay into the model"
+INTO_THE_MODEL = "the search of `drivegain residual` takes the delay into the model"
 
 
 def _diagnosis_of(

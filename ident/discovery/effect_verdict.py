@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum
 
-from ident.discovery.error_change import CONFIDENCE, FEWEST_BLOCKS, ErrorChange
+from ident.discovery.error_change import CONFIDENCE, FEWEST_BLOCKS, ErrorChange, describe_noise
 from ident.effects.effect import PlacedEffect
 from ident.estimators.estimate import RelativeError
 
@@ -63,10 +63,7 @@ def judge_change(change: ErrorChange, motor: int | None = None) -> tuple[Judgeme
     # 9 % of all cases, not in 5 %.
     each = CONFIDENCE if motor is None else 0.5 * (1.0 + CONFIDENCE)
     if not change.is_fall(motor, each):
-        size = f"{change.total.rise:.3g} ± {change.total.std:.2g} noise variances"
-        return Judgement.UNDECIDED, (
-            f"the squared error on held-out runs changes by {size}, which may be noise"
-        )
+        return Judgement.UNDECIDED, describe_noise(change.total, "held-out runs")
     if doubtful := change.doubtful_motors:
         rise = f"the error of motor {doubtful[0] + 1} on held-out runs rises by much"
         return Judgement.UNDECIDED, f"{rise}, although that may be noise"

@@ -193,6 +193,18 @@ def _size(change: PairedChange) -> str:
     return f"{change.rise:.3g} ± {change.std:.2g} noise variances"
 
 
+def describe_noise(change: PairedChange, data: str) -> str:
+    """Say of a change that noise may have made in which direction it goes, and by how much.
+
+    Args:
+        change: of the squared error.
+        data: that have this error.
+    """
+    verb = "falls" if change.rise < 0 else "rises"
+    size = f"{abs(change.rise):.3g} ± {change.std:.2g} noise variances"
+    return f"the squared error on {data} {verb} by {size}, which may be noise"
+
+
 def compare_by_block(change: FloatArray, move: IntArray, run: IntArray) -> PairedChange:
     """Sum the change of each row's squared error, with σ by independent blocks of moves.
 

@@ -23,7 +23,7 @@ from scipy import linalg
 
 from ident.arrays import BoolArray, FloatArray, IntArray, require_count, require_number
 from ident.discovery.candidates import SMALLEST_SINGULAR, SearchProblem
-from ident.discovery.error_change import ErrorChange, change_of_errors
+from ident.discovery.error_change import ErrorChange, change_of_errors, describe_noise
 from ident.effects.effect import Effect, PlacedEffect
 from ident.equations.linearisation import RIDGE, Folds, cut_into_folds, sum_of_squares
 from ident.equations.observation import Observation
@@ -381,8 +381,7 @@ class PartsLeftOut:
         most_affected = int(np.argmax(of_motor))
         if not change.is_enough or change.is_fall(most_affected):
             return ""
-        size = f"{change.total.rise:.3g} ± {change.total.std:.2g} noise variances"
-        return f"the squared error on {data} changes by {size}, which may be noise"
+        return describe_noise(change.total, data)
 
 
 def whitened_columns(search_problem: SearchProblem, effect: Effect, axis: int) -> FloatArray:

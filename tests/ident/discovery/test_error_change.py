@@ -62,6 +62,17 @@ def test_a_fall_of_the_motor_that_the_effect_names_is_a_fall() -> None:
     assert judge_change(change, 1)[0] is Judgement.UNDECIDED
 
 
+@pytest.mark.parametrize(("shift", "verb"), [(-0.5, "falls"), (0.5, "rises")])
+def test_a_change_that_may_be_noise_is_stated_with_its_direction(shift: float, verb: str) -> None:
+    rng = np.random.default_rng(11)
+    by_move = rng.normal(0.0, 5.0, (20, MOTORS))
+    by_move += shift - by_move.mean()
+    judgement, reason = judge_change(_change(by_move))
+    assert judgement is Judgement.UNDECIDED
+    assert reason.startswith(f"the squared error on held-out runs {verb} by 30 ± ")
+    assert reason.endswith(" noise variances, which may be noise")
+
+
 def test_a_fall_in_all_blocks_but_one_is_a_fall() -> None:
     """One move that is predicted worse makes the scatter of all so large that the mean shows
     nothing.
