@@ -214,24 +214,30 @@ def check_velocity(
     noise_rad_s = np.array([SPEED_TOLERANCE * axis.limits.velocity for axis in cell.axes])
     noise_rad = noise_rad_s * window / rate_hz
     largest_rad = velocity.tolerance * size_rad + noise_rad
-    for index in np.flatnonzero(error_rad > largest_rad).tolist():
-        moved = moved_rad[:, index]
-        stated = stated_rad[:, index]
-        # Slope of the straight line through zero that maps stated to moved displacements.
-        stated_square = max(float(stated @ stated), SMALLEST_DIVISOR)
-        ratio = float(moved @ stated) / stated_square
-        size = max(float(size_rad[index]), SMALLEST_DIVISOR)
-        error_percent = 100.0 * float(error_rad[index]) / size
-        tolerance_percent = 100.0 * velocity.tolerance
-        file, column = velocity.places[index]
-        raise TableUnfit(
-            f"{files[file].path}, column {column}, axis {cell.axes[index].name}",
-            found=f"positions that move {ratio:.3g} times as fast as this velocity says, and "
-            f"differ from it by {error_percent:.3g} %",
-            expected=f"velocities that agree with the positions to {tolerance_percent:g} %",
-            remedy="check `unit` and `side` of both, the order of their columns, and the rate or "
-            "the unit of the time; or leave `velocity` out",
-        )
+    wrong = np.flatnonzero(error_rad > largest_rad).tolist()
+    if not wrong:
+        return
+    # Slope of the straight line through zero that maps stated to moved displacements.
+    stated_square = np.maximum(np.sum(stated_rad**2, axis=0), SMALLEST_DIVISOR)
+    ratio = np.sum(moved_rad * stated_rad, axis=0) / stated_square
+    error_percent = 100.0 * error_rad / np.maximum(size_rad, SMALLEST_DIVISOR)
+    first = wrong[0]
+    found = (
+        f"positions that move {ratio[first]:.3g} times as fast as this velocity says, and differ "
+        f"from it by {error_percent[first]:.3g} %"
+    )
+    others = [f"{cell.axes[axis].name} ({ratio[axis]:.3g} times)" for axis in wrong[1:]]
+    if others:
+        found += f"; so do those of {', '.join(others)}"
+    tolerance_percent = 100.0 * velocity.tolerance
+    file, column = velocity.places[first]
+    raise TableUnfit(
+        f"{files[file].path}, column {column}, axis {cell.axes[first].name}",
+        found=found,
+        expected=f"velocities that agree with the positions to {tolerance_percent:g} %",
+        remedy="check `unit` and `side` of both, the order of their columns, and the rate or "
+        "the unit of the time; or leave `velocity` out",
+    )
 
 
 def require_changing(

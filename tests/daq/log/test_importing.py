@@ -1138,9 +1138,13 @@ def test_velocities_that_agree_change_nothing(inputs: ImportInputs, side: str, u
         ),
         ((1, 1, 1, 1, pi / 180, 1), ("axis J5", "move 57.3 times as fast")),
         ((0, 1, 1, 1, 1, 1), ("axis J1", "differ from it by 100 %")),
+        (
+            (1, pi / 180, -1, 1, 1, pi / 180),
+            ("axis J2", "so do those of J3 (-1 times), J6 (57.3 times)"),
+        ),
     ],
 )
-def test_velocities_that_disagree_name_the_axis(
+def test_velocities_that_disagree_name_every_axis(
     inputs: ImportInputs,
     capsys: pytest.CaptureFixture[str],
     factors: tuple[float, ...],
