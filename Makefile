@@ -12,7 +12,7 @@ export OMP_NUM_THREADS ?= 1
 # Compiled modules are kept: without them every program that a test starts would compile all that it imports.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help setup demo figaroh test test-slow test-processes test-vcan chaos guard-study vcan-tools test-console browser check docs test-docs reference sizes screenshots bench bench-stream ident-study gain-study tls-study coverage-study paper planning-study robot-study pivot-study crash-study kill-study session-kill-study console-study soak drift-study holdout-study loop-noise-study diagnosis-study effects-study tx40-study real-study geometry-study damage-study prior-study pairs-study planner-study contact-study weigh-study stopping-study session-study warm-up-study words wheel lock clean chaos-hub write-fault-study mutation-study
+.PHONY: help setup demo figaroh test test-slow test-processes test-vcan chaos guard-study vcan-tools test-console browser check docs test-docs reference sizes screenshots bench bench-stream ident-study gain-study tls-study coverage-study paper planning-study robot-study pivot-study crash-study kill-study session-kill-study console-study soak drift-study holdout-study loop-noise-study diagnosis-study effects-study tx40-study real-study geometry-study damage-study prior-study pairs-study planner-study contact-study weigh-study stopping-study session-study warm-up-study first-certificate words wheel lock clean chaos-hub write-fault-study mutation-study
 
 help:
 	@echo "make demo    set up, then calibrate a simulated six-axis cell end to end into out/demo"
@@ -61,6 +61,7 @@ help:
 	@echo "make weigh-study  coverage of the error bars of a weighed payload (docs/evidence/estimators.md); resumable, half an hour"
 	@echo "make stopping-study  gains and their error bars where a recording ends as soon as every error bar is at its target (docs/evidence/stopping.md); resumable, ten minutes"
 	@echo "make warm-up-study  how far friction that falls while the arm warms up bends the gains, by the order of blocks; resumable, an hour"
+	@echo "make first-certificate  README's first session at a terminal: words to read, time beside the motion; minutes"
 	@echo "make prior-study  full parameters under right and wrong priors: coverage, and what is noticed (docs/evidence/prior.md); resumable, twenty minutes"
 	@echo "make pairs-study  gains of independent recordings of one arm beside their error bars, after the search (docs/evidence/pairs.md); resumable, hours"
 	@echo "make planner-study  error bars that the planner predicts beside those of the fit, slow noise too (docs/evidence/planning.md); minutes"
@@ -238,6 +239,9 @@ planner-study: setup
 
 contact-study: setup
 	$(BIN)/python -m tests.studies.contact_study --tables docs/evidence/data
+
+first-certificate: setup
+	$(BIN)/python -m tests.studies.first_certificate
 
 warm-up-study: setup
 	$(BIN)/python -m tests.studies.warm_up_study
