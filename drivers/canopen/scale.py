@@ -168,6 +168,8 @@ def _read_rated(
             missing = "no rated torque"
         else:
             missing = f"drive reports no rated torque ({rated.torque})"
-        found = f"{missing}; the torque constant cannot be checked{unlogged}"
+        found = (
+            f"{missing}; the torque constant cannot be checked (no gain depends on this){unlogged}"
+        )
         return current * rated.ampere_per_unit, None, (found,)
     return current * rated.ampere_per_unit, torque * rated.newton_metre_per_unit, ()
