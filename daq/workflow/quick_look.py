@@ -118,6 +118,7 @@ class GainsSoFar:
     #: Motion of each block with what was mounted.
     motions: tuple[tuple[Excitation, tuple[int | None, ...]], ...] = ()
     motion_s: float = 0.0  #: of these blocks
+    loaded_s: float = 0.0  #: of those with the payload
     honest_s: float = HONEST_S  #: motion before the first figures
     #: σ of the estimator over the quick one after the same blocks, shape (n,); None before the
     #: first block was judged.
@@ -164,8 +165,22 @@ class GainsSoFar:
         mounted = None if run.payload is None else 0
         motion = recorded(model, data, self.fit.conditioning)
         seconds = float(run.time_s[-1] - run.time_s[0])
+        loaded_s = self.loaded_s
+        if mounted is not None:
+            loaded_s += seconds
         motions = (*self.motions, (motion, (mounted,)))
-        return replace(self, motions=motions, motion_s=self.motion_s + seconds)
+        motion_s = self.motion_s + seconds
+        return replace(self, motions=motions, motion_s=motion_s, loaded_s=loaded_s)
+
+    @property
+    def counting_s(self) -> float:
+        """Motion as far as it counts for σ [s]: twice that of the mounting with less of it.
+
+        Gains need both mountings. In the first loaded block, σ falls with the motion of that block
+        alone, however long the bare ones were.
+        """
+        bare_s = self.motion_s - self.loaded_s
+        return 2.0 * min(bare_s, self.loaded_s)
 
     def in_proportion(self, std_percent: FloatArray) -> GainsSoFar:
         """Show σ from now on in proportion to that of the estimator after these blocks.
@@ -198,7 +213,7 @@ class GainsSoFar:
         if self.scale is not None:
             std_percent = std_percent * self.scale
         target_percent = np.full(len(std_percent), self.target_percent)
-        outlook = time_to_target(std_percent, target_percent, self.motion_s)
+        outlook = time_to_target(std_percent, target_percent, self.counting_s)
         worst = self.experiment.cell.axes[outlook.worst].name
         return replace(
             nothing,

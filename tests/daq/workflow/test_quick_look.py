@@ -167,6 +167,29 @@ def test_after_a_move_each_gain_is_beside_its_target_with_the_worst_first(
 
 
 @pytest.mark.slow
+def test_the_time_left_counts_the_mounting_with_less_motion_twice(
+    nothing: GainsSoFar, blocks: tuple[Run, ...]
+) -> None:
+    """After a short part of the first loaded block, the long bare blocks do not make the rest
+    long: σ falls with the loaded motion.
+    """
+    bare, loaded, _ = blocks
+    samples = 6000
+    part = replace(
+        loaded,
+        time_s=loaded.time_s[:samples],
+        position_rad=loaded.position_rad[:samples],
+        current_a=loaded.current_a[:samples],
+    )
+    known = nothing.with_run(bare).with_motion(bare).with_run(part).with_motion(part)
+    part_s = float(part.time_s[-1])
+    look = replace(known, honest_s=0.0).look(PLACE, {})
+    ratio = look.gains[0].ratio
+    assert ratio > 1.0
+    assert look.left_s == pytest.approx(2.0 * part_s * (ratio**2 - 1.0))
+
+
+@pytest.mark.slow
 def test_sigma_goes_on_from_that_of_the_estimator(
     nothing: GainsSoFar, blocks: tuple[Run, ...]
 ) -> None:
