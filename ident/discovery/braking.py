@@ -7,9 +7,9 @@ region that the fit had not seen, such a fit was off by 18 % of the torque, the 
 by 5 %. Likewise, friction that depends on the position can be negative where no run has been.
 
 So the declared dry and viscous friction is judged together with all effects of the speed and of the
-position on its axis. With c, a and b their coefficients, it is
+position on its axis, one's own as well. With c their coefficients and φ(v, q) their columns, it is
 
-    f(v, q) = fs + fv |v| + sign(v) Σ c φ(v) + a cos q + b sin q ≥ 0,
+    f(v, q) = fs + fv |v| + sign(v) Σ c φ(v, q) ≥ 0,
 
 for 0 < |v| ≤ the largest speed of the runs, in both directions, and for all q within the joint's
 travel about the middle of its runs. The limit v → 0 is the friction at which the axis begins to
@@ -29,16 +29,26 @@ import numpy as np
 from ident.arrays import FloatArray, IntArray
 from ident.discovery.evidence import Evidence
 from ident.discovery.gates import SIGMAS, own_unknowns
-from ident.effects.effect import PlacedEffect
-from ident.effects.friction import PositionFriction, SpeedFriction
-from ident.effects.signals import Abscissa
+from ident.effects.effect import Effect, GearSide, PlacedEffect, Property, columns_at
+from ident.effects.signals import Abscissa, Signals
 from ident.model.bodies import LOADED
-from ident.model.regressor import cos_sin
 
 #: Speeds at which friction is judged, as shares of the largest; the first is the limit at rest
 SPEEDS = np.concatenate(([1e-6], np.geomspace(1e-3, 1.0, 25)))
 #: Positions at which friction that depends on the position is judged: over one turn, 7.7° apart
 POSITIONS = 48
+FRICTION = frozenset({Property.ODD_IN_VELOCITY, Property.EVEN_IN_VELOCITY})
+"""Properties of friction; an even one is more friction in one direction than in the other."""
+
+
+def is_friction_of_motion(effect: Effect) -> bool:
+    """Whether an effect is friction of a driven joint by its speed and position alone."""
+    return (
+        effect.declares in FRICTION
+        and effect.abscissa in {Abscissa.VELOCITY, Abscissa.POSITION}
+        and effect.side is GearSide.JOINT
+        and effect.with_motor
+    )
 
 
 def describe_driving_friction(evidence: Evidence, axis: int) -> str:
@@ -49,10 +59,11 @@ def describe_driving_friction(evidence: Evidence, axis: int) -> str:
         axis: index of the axis.
     """
     effects = _judged_effects(evidence, axis)
-    if effects is None:
+    if not effects:
         return ""
+    is_of_position = any(placed.effect.abscissa is Abscissa.POSITION for placed in effects)
     positions_rad = np.zeros(1)
-    if effects.of_position:
+    if is_of_position:
         positions_rad = _positions(evidence, axis)
     largest_speed = 0.0
     for data in evidence.fit_runs:
@@ -62,45 +73,25 @@ def describe_driving_friction(evidence: Evidence, axis: int) -> str:
     for declared in _declared_friction(evidence, axis):
         for direction in (1.0, -1.0):
             velocities = direction * largest_speed * SPEEDS
-            judged += _friction_at(evidence, declared, effects, velocities, positions_rad)
+            judged += _friction_at(evidence, axis, declared, effects, velocities, positions_rad)
     worst = min(judged, key=lambda friction: friction.largest_possible, default=None)
     if worst is None or worst.largest_possible >= 0.0:
         return ""
     place = _velocity_text(worst, largest_speed)
-    if effects.of_position:
+    if is_of_position:
         place += f", where its position is {worst.position_rad:.2g} rad"
     torque = f"{worst.torque:.3g} ± {worst.std:.2g} {worst.unit}"
     return f"the friction of this axis would push the arm {place} ({torque})"
 
 
-@dataclass(frozen=True, slots=True)
-class _JudgedEffects:
-    """Effects of an axis that are part of f(v, q)."""
-
-    of_speed: tuple[tuple[PlacedEffect, SpeedFriction], ...]
-    of_position: tuple[PlacedEffect, ...]
-
-
-def _judged_effects(evidence: Evidence, axis: int) -> _JudgedEffects | None:
-    """Effects of the speed and of the position on an axis.
-
-    None where there are none, or where its friction depends on the temperature.
+def _judged_effects(evidence: Evidence, axis: int) -> tuple[PlacedEffect, ...]:
+    """Friction of an axis by speed and position alone;
+    none where its friction depends on the temperature.
     """
-    of_speed: list[tuple[PlacedEffect, SpeedFriction]] = []
-    of_position: list[PlacedEffect] = []
-    for placed in evidence.effects:
-        effect = placed.effect
-        if placed.axis != axis:
-            continue
-        if effect.abscissa is Abscissa.TEMPERATURE:
-            return None
-        if isinstance(effect, SpeedFriction):
-            of_speed.append((placed, effect))
-        if isinstance(effect, PositionFriction):
-            of_position.append(placed)
-    if not of_speed and not of_position:
-        return None
-    return _JudgedEffects(tuple(of_speed), tuple(of_position))
+    of_axis = [placed for placed in evidence.effects if placed.axis == axis]
+    if any(placed.effect.abscissa is Abscissa.TEMPERATURE for placed in of_axis):
+        return ()
+    return tuple(placed for placed in of_axis if is_friction_of_motion(placed.effect))
 
 
 @dataclass(frozen=True, slots=True)
@@ -192,10 +183,39 @@ def _positions(evidence: Evidence, axis: int) -> FloatArray:
     return middle + covered_rad * np.linspace(-0.5, 0.5, POSITIONS)
 
 
+def _motion(axes: int, velocity: FloatArray, position_rad: FloatArray) -> Signals:
+    """Signals of joints that all pass through the same velocities and positions, without load.
+
+    Args:
+        axes: number of joints.
+        velocity: of each sample [rad/s; m/s of a prismatic joint], shape (k,).
+        position_rad: of each sample, shape (k,).
+    """
+    of_joints = (axes, 1)
+    positions_rad = np.tile(position_rad, of_joints)
+    nothing = np.zeros(positions_rad.shape)
+    samples = np.arange(len(velocity), dtype=np.float64)
+    return Signals(
+        rate_hz=1.0,
+        time_s=samples,
+        session_s=samples,
+        position_rad=positions_rad,
+        velocity_rad_s=np.tile(velocity, of_joints),
+        acceleration_rad_s2=nothing,
+        motor_position_rad=positions_rad,
+        inertia_kg_m2=np.empty((axes, axes, 0)),
+        load_torque_nm=nothing,
+        geared_torque_nm=nothing,
+        motor_torque_nm=nothing,
+        current_a=nothing,
+    )
+
+
 def _friction_at(
     evidence: Evidence,
+    axis: int,
     declared: _Declared,
-    effects: _JudgedEffects,
+    effects: tuple[PlacedEffect, ...],
     velocities: FloatArray,
     positions_rad: FloatArray,
 ) -> list[_Friction]:
@@ -203,6 +223,7 @@ def _friction_at(
 
     Args:
         evidence: a joint fit.
+        axis: index.
         declared: its dry and viscous friction.
         effects: its effects of the speed and of the position.
         velocities: all of one sign, shape (v,).
@@ -227,11 +248,10 @@ def _friction_at(
     viscous = gain_count + np.array(declared.viscous)
     weights[:, dry] = 1.0
     weights[:, viscous] = np.abs(velocity)[:, None]
-    for placed, effect in effects.of_speed:
-        per_coefficient = np.sign(velocity) * effect.at_speed(velocity)
-        weights[:, indices(placed)] = per_coefficient.T
-    for placed in effects.of_position:
-        weights[:, indices(placed)] = np.stack(cos_sin(position_rad), axis=-1)
+    motion = _motion(len(estimate.gains), velocity, position_rad)
+    for placed in effects:
+        columns = columns_at(placed.effect, motion, axis)
+        weights[:, indices(placed)] = (np.sign(velocity) * columns).T
     torque = weights @ unknowns
     variance = np.einsum("kp,pq,kq->k", weights, estimate.covariance, weights, optimize=True)
     std = np.sqrt(variance)

@@ -17,7 +17,7 @@ import numpy as np
 
 from ident.arrays import FloatArray
 from ident.discovery.beside_stops import fitted_clear_of_stops, turns_with_motion
-from ident.discovery.braking import describe_driving_friction
+from ident.discovery.braking import describe_driving_friction, is_friction_of_motion
 from ident.discovery.candidates import (
     CandidateTrial,
     ColumnCache,
@@ -56,7 +56,6 @@ from ident.discovery.rotor_search import with_refined_rotor
 from ident.discovery.search import Finding, is_better, rank_families
 from ident.discovery.structure import is_inadequate
 from ident.effects.effect import Effect, EffectKey, PlacedEffect, Reported, effect_key
-from ident.effects.friction import PositionFriction, SpeedFriction
 from ident.effects.geometry_corrections import LatePosition, is_correction
 from ident.effects.signals import Abscissa
 from ident.effects.unnamed import is_unnamed
@@ -504,7 +503,7 @@ def judge_beside_others(
     if effect.reported is Reported.AMPLITUDE:
         reasons.append(uncertain_amplitude(values, covariance))
     reasons.append(impossible(effect.coefficients, values, deviations))
-    if isinstance(effect, SpeedFriction | PositionFriction):
+    if is_friction_of_motion(effect):
         reasons.append(describe_driving_friction(model.evidence, placed.axis))
     reasons.append(PartsLeftOut.of(problem).refusal(columns))
     given = [reason for reason in reasons if reason]

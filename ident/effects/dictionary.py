@@ -10,10 +10,16 @@ with the same columns. Then:
    parameters.
 2. Add its family to EFFECTS, with the values of its searched parameters that the search tries.
 
-Search, refit, prediction, calibration files and reports then know it. The tests ask for one thing
-more: a recording with the effect, planted by a formula of your own, in
-`tests/ident/discovery/test_planted.py`. A phrase for reports may go into
-`daq/report/effect_names.py`.
+Search, refit, prediction, calibration files and reports then know it. The tests ask for more:
+
+- a recording with the effect, planted by a formula of your own, in
+  `tests/ident/discovery/test_planted.py`;
+- its name in `EITHER_SIGN` of `tests/ident/discovery/test_gates.py`, if a coefficient may be
+  negative;
+- its name in `tests/ident/discovery/test_braking.py`, if it is friction by speed and position;
+- a row in `docs/explanation/effects.md`.
+
+A phrase for reports may go into `daq/report/effect_names.py`.
 """
 
 from __future__ import annotations

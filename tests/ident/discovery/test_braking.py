@@ -5,19 +5,20 @@ written.
 from __future__ import annotations
 
 import re
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from ident.data.dataset import Dataset
-from ident.discovery.braking import describe_driving_friction
+from ident.discovery.braking import describe_driving_friction, is_friction_of_motion
 from ident.discovery.evidence import Evidence, with_effects
 from ident.discovery.gates import Gates
 from ident.discovery.joining import SetAside
 from ident.discovery.loop import find_effects
-from ident.effects.effect import PlacedEffect
+from ident.effects.dictionary import EFFECTS
+from ident.effects.effect import Effect, PlacedEffect, Property
 from ident.effects.friction import (
     AsymmetricViscous,
     NonlinearViscous,
@@ -25,6 +26,8 @@ from ident.effects.friction import (
     SpeedFriction,
     Stribeck,
 )
+from ident.effects.signals import Abscissa, Signals
+from ident.model.model import Column
 from tests.ident.recordings import (
     MOUNTED,
     Truth,
@@ -202,12 +205,32 @@ def _with_swing(clean: Evidence, truth: Truth, swing_nm: float, offset_nm: float
     return bent(clean, truth, torque)
 
 
+@dataclass(frozen=True, slots=True)
+class RunOut(Effect):
+    """Friction of the position as a person writes it, who does not know the one of the dictionary.
+
+    τ = sign(q̇) (a cos q + b sin q).
+    """
+
+    name = "run-out"
+    declares = Property.ODD_IN_VELOCITY
+    abscissa = Abscissa.POSITION
+    coefficients = (Column("a", "Nm"), Column("b", "Nm"))
+
+    def columns(self, signals: Signals, axis: int) -> FloatArray:
+        """Columns, shape (2, k)."""
+        q = signals.position_rad[axis]
+        size = np.stack((np.cos(q), np.sin(q)))
+        return np.asarray(size * np.sign(signals.velocity_rad_s[axis]))
+
+
+@pytest.mark.parametrize("effect", [PositionFriction(), RunOut()])
 def test_friction_that_pushes_at_a_position_is_named_with_that_position(
-    clean: Evidence, truth: Truth
+    clean: Evidence, truth: Truth, effect: Effect
 ) -> None:
     # 25 Nm of a cosine on a dry friction of less: half a turn from zero it would push.
     worn = _with_swing(clean, truth, 25.0, -10.0)
-    fitted = with_effects(worn, (PlacedEffect(PositionFriction(), AXIS),))
+    fitted = with_effects(worn, (PlacedEffect(effect, AXIS),))
     said = describe_driving_friction(fitted, AXIS)
     assert said.startswith("the friction of this axis would push the arm at rest, where its")
     position_rad = float(re.findall(r"position is (-?[\d.]+) rad", said)[0])
@@ -219,8 +242,27 @@ def test_friction_that_brakes_at_every_position_may_depend_on_it(
     clean: Evidence, truth: Truth
 ) -> None:
     worn = _with_swing(clean, truth, 4.0, 4.0)
-    fitted = with_effects(worn, (PlacedEffect(PositionFriction(), AXIS),))
-    assert describe_driving_friction(fitted, AXIS) == ""
+    for effect in (PositionFriction(), RunOut()):
+        fitted = with_effects(worn, (PlacedEffect(effect, AXIS),))
+        assert describe_driving_friction(fitted, AXIS) == ""
+
+
+def test_effects_of_speed_and_position_alone_are_judged() -> None:
+    judged = {family[0].name for family in EFFECTS if is_friction_of_motion(family[0])}
+    expected = {"stribeck", "nonlinear-viscous", "asymmetric-viscous", "position-friction"}
+    assert judged == expected
+    assert is_friction_of_motion(RunOut())
+
+
+def test_an_effect_of_ones_own_that_drives_the_arm_is_not_written(
+    clean: Evidence, truth: Truth
+) -> None:
+    """Without the dictionary's own effect, it would explain the residual."""
+    worn = _with_swing(clean, truth, 25.0, -10.0)
+    own = tuple(family for family in EFFECTS if family[0].name != "position-friction")
+    steps = find_effects(worn, np.random.default_rng(0), GATES, families=(*own, (RunOut(),)))
+    end = steps[-1].after
+    assert all(placed.effect.name != "run-out" for placed in end.effects)
 
 
 def test_the_search_writes_no_friction_of_the_position_that_drives_the_arm(
