@@ -50,6 +50,7 @@ SHIPPED = (
     "dualv",
 )
 _SHIPPED_FAULTS = "faults-example"
+HUB_PORT = 29536  #: Of a hub, if none is given: that of cell files without a port
 LARGEST_NAME_FILE_BYTES = 4096  #: Size of a file that names a body
 
 
@@ -78,8 +79,11 @@ def simulate(
         ),
     ] = None,
     port: Annotated[
-        int, typer.Option(help="Port of the hub; 0 takes a free one.", min=0, max=65535)
-    ] = 29536,
+        int | None,
+        typer.Option(
+            help=f"Port of the hub, {HUB_PORT} by default; 0 takes a free one.", min=0, max=65535
+        ),
+    ] = None,
     payload_from: Annotated[
         Path | None,
         typer.Option(
@@ -103,8 +107,8 @@ def simulate(
         shipped_simulation,
     )
     from daq.workflow.bus_lock import require_untaken
-    from drivers.canopen.bus import BusAddress, bus_errors, open_bus
-    from drivers.canopen.split_bus import BusPart, SplitAddress, open_cell_bus
+    from drivers.canopen.bus import BusAddress, bus_errors
+    from drivers.canopen.split_bus import BusPart, CellAddress, SplitAddress, open_cell_bus
     from drivers.simulation.hub import Hub
 
     require_simulator()
@@ -112,6 +116,7 @@ def simulate(
     from drivers.simulation.spec import SpecInvalid
 
     at_most_one(payload_from=payload_from, payload=payload)
+    hub_port = port_of_hub(interface, port)
     # A folder of that name, as `init` makes it, is no simulation file.
     shipped = simulation.name in SHIPPED and not simulation.is_file()
     truth = shipped_simulation(simulation.name) if shipped else simulation
@@ -135,28 +140,20 @@ def simulate(
         interruptible(signals=(signal.SIGINT, signal.SIGTERM)),
         ExitStack() as stack,
     ):
-        there = (
-            nodes_on_buses(bus, [axis.node_id for axis in spec.axes])
-            if bus
-            else {channel: frozenset()}
-        )
-        hub = (
-            stack.enter_context(Hub(tuple(there), port))
-            if interface_of(interface) is SOCKETCAND
-            else None
-        )
-        parts = tuple(
-            BusPart(name, BusAddress(interface, name) if hub is None else hub.address(name), nodes)
-            for name, nodes in there.items()
-        )
-        if hub is None:  # a hub is a bus of this program, on which nobody is yet
-            require_untaken(part.address for part in parts)
-        address = SplitAddress(parts) if bus else parts[0].address
-        end = (
-            open_cell_bus(address)
-            if isinstance(address, SplitAddress)
-            else open_bus(address, answering=True)
-        )
+        nodes_by_bus: dict[str, frozenset[int]] = {channel: frozenset()}
+        if bus:
+            nodes_by_bus = nodes_on_buses(bus, [axis.node_id for axis in spec.axes])
+        addresses = {name: BusAddress(interface, name) for name in nodes_by_bus}
+        if hub_port is not None:
+            hub = stack.enter_context(Hub(tuple(nodes_by_bus), hub_port))
+            addresses = {name: hub.address(name) for name in nodes_by_bus}
+        else:  # a hub is a bus of this program, on which nobody is yet
+            require_untaken(addresses.values())
+        parts = tuple(BusPart(name, addresses[name], nodes) for name, nodes in nodes_by_bus.items())
+        address: CellAddress = parts[0].address
+        if bus:
+            address = SplitAddress(parts)
+        end = open_cell_bus(address, answering=True)
         stack.callback(end.shutdown)
         try:
             cell = SimulatedCell(spec, end, mounted=mounted)
@@ -223,6 +220,28 @@ class MountedFile:
             name = head.decode("utf-8", "replace").partition("\n")[0].strip()
             return None if name == "none" else name or self._name  # empty while it is being written
         return None
+
+
+def port_of_hub(interface: str, port: int | None) -> int | None:
+    """Return the port of the hub; None on an interface that has no hub.
+
+    Args:
+        interface: as it is typed.
+        port: as it is typed; None for the usual one.
+
+    Raises:
+        UsageError: a port is typed for an interface without a hub.
+    """
+    if interface_of(interface) is SOCKETCAND:
+        return HUB_PORT if port is None else port
+    if port is not None:
+        raise UsageError(
+            f"--port {port}",
+            found=f"the interface {interface}, which has no hub",
+            expected=f"a port for {SOCKETCAND.name} alone",
+            remedy=f"leave --port out, or take --interface {SOCKETCAND.name}",
+        )
+    return None
 
 
 def nodes_on_buses(options: Sequence[str], node_ids: Sequence[int]) -> dict[str, frozenset[int]]:

@@ -84,15 +84,19 @@ class SplitAddress:
 CellAddress = BusAddress | SplitAddress  #: Address of one bus, or of several
 
 
-def open_cell_bus(address: CellAddress) -> can.BusABC:
+def open_cell_bus(address: CellAddress, *, answering: bool = False) -> can.BusABC:
     """Open one end of the bus of a cell, or of every bus as one.
+
+    Args:
+        address: of the cell.
+        answering: for devices that answer each frame, see `open_bus`.
 
     Raises:
         BusError: one cannot be opened (those before it are closed again), or two have a node id in
             common.
     """
     if isinstance(address, BusAddress):
-        return open_bus(address)
+        return open_bus(address, answering=answering)
     homes: dict[int, BusPart] = {}
     for part in address.parts:
         for node_id in part.node_ids:
@@ -104,7 +108,7 @@ def open_cell_bus(address: CellAddress) -> can.BusABC:
     ends: list[can.BusABC] = []
     for part in address.parts:
         try:
-            ends.append(open_bus(part.address))
+            ends.append(open_bus(part.address, answering=answering))
         except BusError as error:
             for end in ends:
                 end.shutdown()

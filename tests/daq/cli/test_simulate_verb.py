@@ -16,7 +16,7 @@ import yaml
 
 import daq.simulation.simulation_file
 from daq.cli.app import main
-from daq.cli.simulate import MountedFile, how_to_reach, nodes_on_buses
+from daq.cli.simulate import MountedFile, how_to_reach, nodes_on_buses, port_of_hub
 from daq.config.cell_file import load_cell
 from daq.errors import ExitCode, UsageError
 from daq.workflow.bus_lock import bus_lock, require_untaken
@@ -61,6 +61,14 @@ def test_what_is_said_wrongly_of_a_bus_is_refused(said: tuple[str, ...], message
     assert message in (
         f"{caught.value.subject} {caught.value.found}; expected: {caught.value.expected}"
     )
+
+
+def test_a_port_is_of_a_hub_alone() -> None:
+    assert port_of_hub("socketcand", None) == 29536
+    assert port_of_hub("socketcand", 0) == 0
+    assert port_of_hub("socketcan", None) is None
+    with pytest.raises(UsageError, match="the interface socketcan, which has no hub"):
+        port_of_hub("socketcan", 29537)
 
 
 def test_the_part_of_a_cell_file_can_be_pasted() -> None:

@@ -419,8 +419,8 @@ def test_a_bus_that_cannot_be_opened_is_named_and_the_others_are_closed(
 ) -> None:
     opened: list[can.BusABC] = []
 
-    def remember(address: BusAddress) -> can.BusABC:
-        opened.append(open_bus(address))
+    def remember(address: BusAddress, *, answering: bool) -> can.BusABC:
+        opened.append(open_bus(address, answering=answering))
         return opened[-1]
 
     monkeypatch.setattr("drivers.canopen.split_bus.open_bus", remember)
@@ -431,6 +431,25 @@ def test_a_bus_that_cannot_be_opened_is_named_and_the_others_are_closed(
         open_cell_bus(SplitAddress(parts))
     with pytest.raises(can.CanOperationError):
         opened[0].send(frame(SYNC))
+
+
+@pytest.mark.parametrize("answering", [False, True])
+def test_every_bus_is_opened_for_devices_that_answer(
+    monkeypatch: pytest.MonkeyPatch, answering: bool
+) -> None:
+    """A simulated cell answers each frame: on SocketCAN a process in between would cost time."""
+    asked: list[bool] = []
+
+    def remember(address: BusAddress, *, answering: bool) -> can.BusABC:
+        asked.append(answering)
+        return open_bus(address)
+
+    monkeypatch.setattr("drivers.canopen.split_bus.open_bus", remember)
+    left = BusPart("left", BusAddress("virtual", "answers left"), LEFT)
+    right = BusPart("right", BusAddress("virtual", "answers right"), RIGHT)
+    open_cell_bus(SplitAddress((left, right)), answering=answering).shutdown()
+    open_cell_bus(left.address, answering=answering).shutdown()
+    assert asked == [answering] * 3
 
 
 def test_closing_closes_all_although_one_fails(pair: Pair) -> None:
