@@ -10,17 +10,19 @@ To add a format:
    values, once for each parser). It overrides `path_of` where keys are no dotted paths, and
    `number` where a parser's value contains blanks around the number; `encoding` is that of a file
    that is not UTF-8.
-2. Add one line to `FORMATS` below, and the name of the format to `ControllerFormat`: the word in
+2. Add one entry to `FORMATS` below, and the name of the format to `ControllerFormat`: the word in
    the cell file.
-3. In `tests/daq/formats/test_documents.py` add a strategy of files to `CASES`, an independent
-   reader to `test_another_reader_sees_the_new_numbers_and_nothing_else_new`, and the suffixes to
-   `test_the_name_gives_the_format` (`a.conf` is there for a suffix that no format has).
+3. In `tests/daq/formats/test_documents.py` add a strategy of files and a reader that knows nothing
+   of this project's keys to `CASES`, and the suffixes to `test_the_name_gives_the_format` (`a.conf`
+   is there for a suffix that no format has).
+4. Name the format in `docs/how-to/write-gains.md`; `make reference` writes the other pages.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 from daq.config.controller import ControllerFormat
@@ -32,27 +34,36 @@ from daq.formats.scalar import ControllerDocument
 from daq.formats.xml_document import xml_document
 from daq.formats.yaml_document import yaml_document
 
-FORMATS: dict[
-    ControllerFormat, tuple[Callable[[bytes, str], ControllerDocument], tuple[str, ...]]
-] = {
-    ControllerFormat.YAML: (yaml_document, (".yaml", ".yml")),
-    ControllerFormat.JSON: (json_document, (".json",)),
-    ControllerFormat.XML: (xml_document, (".xml",)),
-    ControllerFormat.DCF: (dcf_document, (".dcf", ".eds")),
+
+@dataclass(frozen=True, slots=True)
+class FormatOfFile:
+    """What belongs to a format."""
+
+    read: Callable[[bytes, str], ControllerDocument]  #: from content and name of a file
+    suffixes: tuple[str, ...]  #: of its files
+    #: a comment behind a number on its line; None where a format has none there
+    comment: re.Pattern[str] | None = None
+
+
+FORMATS = {
+    ControllerFormat.YAML: FormatOfFile(
+        yaml_document,
+        (".yaml", ".yml"),
+        re.compile(r"[^\r\n#]*[ \t]#[ \t]*([^\r\n]*[^\s])"),
+    ),
+    ControllerFormat.JSON: FormatOfFile(json_document, (".json",)),
+    ControllerFormat.XML: FormatOfFile(
+        xml_document, (".xml",), re.compile(r"[^\r\n]*?<!--[ \t]*([^\r\n]*?)[ \t]*-->")
+    ),
+    ControllerFormat.DCF: FormatOfFile(dcf_document, (".dcf", ".eds")),
 }
-"""Reader of each format (content and name of the file), and the suffixes of its files."""
-_COMMENTS: dict[ControllerFormat, re.Pattern[str]] = {
-    ControllerFormat.YAML: re.compile(r"[^\r\n#]*[ \t]#[ \t]*([^\r\n]*[^\s])"),
-    ControllerFormat.XML: re.compile(r"[^\r\n]*?<!--[ \t]*([^\r\n]*?)[ \t]*-->"),
-}
-"""Comment after a number, by format; the other formats have none on the line of a number."""
 
 
 def format_of(name: str) -> ControllerFormat:
     """Return the format that a file's name says, a backup's too; YAML where it says none."""
     for suffix in reversed(Path(name).suffixes):
-        for known, (_, suffixes) in FORMATS.items():
-            if suffix.lower() in suffixes:
+        for known, kind in FORMATS.items():
+            if suffix.lower() in kind.suffixes:
                 return known
     return ControllerFormat.YAML
 
@@ -65,7 +76,7 @@ def comment_behind(rest: str, name: str, file_format: ControllerFormat | None = 
         name: of the file.
         file_format: of the file; None where its name says it.
     """
-    pattern = _COMMENTS.get(file_format or format_of(name))
+    pattern = FORMATS[file_format or format_of(name)].comment
     if pattern is None:
         return ""
     found = pattern.match(rest)
@@ -84,8 +95,8 @@ def decode_document(
     Raises:
         ControllerUnfit: the bytes are no text of that format; other flaws are found by `locate`.
     """
-    reader, _ = FORMATS[format or format_of(name)]
-    return reader(content, name)
+    kind = FORMATS[format or format_of(name)]
+    return kind.read(content, name)
 
 
 def read_controller_file(path: Path) -> bytes:
