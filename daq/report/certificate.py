@@ -219,30 +219,30 @@ class Certificate:
     calibration: Calibration
     comparison: Comparison
     origin: Origin
-    rows: tuple[AxisRow, ...]  #: change from the current gain or the nameplate, one an axis
-    #: Comparison with the previous gains, those before the write that is in force; None where there
-    #: is none of them.
-    before: Comparison | None = None
-    changed: tuple[AxisRow, ...] = ()  #: change by that write, one an axis; empty without it
+    #: change from the current gain or the nameplate, one an axis
+    proposed_rows: tuple[AxisRow, ...]
+    #: Comparison with the gains before the write that is in force; None where there are none.
+    before_write: Comparison | None = None
+    written_rows: tuple[AxisRow, ...] = ()  #: change by that write, one an axis; empty without it
     earlier: Calibration | None = None  #: another calibration of the cell to compare with
     #: Change from the earlier calibration, judged with the σ of both, one an axis; empty without
     #: one.
-    since: tuple[AxisRow, ...] = ()
+    rows_since_earlier: tuple[AxisRow, ...] = ()
 
     @property
-    def shown(self) -> tuple[AxisRow, ...]:
+    def shown_rows(self) -> tuple[AxisRow, ...]:
         """Change of each gain as the page shows it: by the write, once the gains are written."""
-        return self.changed or self.rows
+        return self.written_rows or self.proposed_rows
 
     @property
     def compared_with(self) -> str:
-        """Word for the gains that `shown` compares with, the same on every axis."""
-        return self.shown[0].change.compared_with.value
+        """Word for the gains that `shown_rows` compares with, the same on every axis."""
+        return self.shown_rows[0].change.compared_with.value
 
     @property
     def note(self) -> str:
         """Meaning of a difference beyond noise, as `apply` states it."""
-        comparison = self.before or self.comparison
+        comparison = self.before_write or self.comparison
         return noise_note(comparison.changes, comparison.known)
 
     @property
@@ -253,7 +253,7 @@ class Certificate:
             return Verdict.REFUSED
         if self.comparison.edit is None:
             return Verdict.NOT_COMPARED
-        if not any(row.significant for row in self.rows):
+        if not any(row.significant for row in self.proposed_rows):
             return Verdict.UNCHANGED
         if gates:
             return Verdict.WAITING
@@ -273,12 +273,12 @@ class Certificate:
     @property
     def _verdict_sentence(self) -> str:
         """The verdict by gains and checks."""
-        differing = [row for row in self.shown if row.significant]
+        differing = [row for row in self.shown_rows if row.significant]
         most = max(differing, key=lambda row: abs(row.change.change_percent), default=None)
         furthest = ""
         if most is not None:
             furthest = f"{most.change.axis} most, by {most.change.change_percent:+.1f} %"
-        total = len(self.shown)
+        total = len(self.shown_rows)
         count = f"all {total} gains"
         if len(differing) != total:
             count = f"{len(differing)} of {total} gains"
@@ -335,7 +335,7 @@ class Certificate:
         """
         text = write_text(write)
         sentence = f"{text[0].upper()}{text[1:]}"
-        if any(row.significant for row in self.changed):
+        if any(row.significant for row in self.written_rows):
             sentence += f": {changed}"
         if self.contradicted:
             sentence += f". New moves contradict them: {self.contradicted}"
@@ -390,28 +390,29 @@ def certify(
             another cell or of other axes.
     """
     _require_whole(calibration)
-    since: tuple[AxisRow, ...] = ()
+    rows_since_earlier: tuple[AxisRow, ...] = ()
     if earlier is not None:
         _require_whole(earlier)
         _require_same(calibration, earlier)
         gains = {gain.axis: gain.value for gain in earlier.gains}
         changes = changes_from(gains, GainOrigin.EARLIER, calibration)
         known = Spread({gain.axis: gain.std for gain in earlier.gains})
-        since = _rows(replace(comparison, changes=changes, refusals=(), known=known))
+        with_earlier = replace(comparison, changes=changes, refusals=(), known=known)
+        rows_since_earlier = _rows(with_earlier)
     origin = origin or Origin.of(calibration)
-    before = before_write(comparison, origin.sha256)
-    changed: tuple[AxisRow, ...] = ()
-    if before is not None:
-        changed = _rows(before)
+    previous = before_write(comparison, origin.sha256)
+    written_rows: tuple[AxisRow, ...] = ()
+    if previous is not None:
+        written_rows = _rows(previous)
     return Certificate(
         calibration=calibration,
         comparison=comparison,
         origin=origin,
-        rows=_rows(comparison),
-        before=before,
-        changed=changed,
+        proposed_rows=_rows(comparison),
+        before_write=previous,
+        written_rows=written_rows,
         earlier=earlier,
-        since=since,
+        rows_since_earlier=rows_since_earlier,
     )
 
 
@@ -473,8 +474,8 @@ def certificate_report(certificate: Certificate) -> CertificateReport:
     edit = comparison.edit
     beside = None
     if certificate.earlier is not None:
-        since = [_certified_gain(row) for row in certificate.since]
-        beside = EarlierCalibration.of(certificate.earlier, axes=since)
+        axes = [_certified_gain(row) for row in certificate.rows_since_earlier]
+        beside = EarlierCalibration.of(certificate.earlier, axes=axes)
     effects = []
     for effect in calibration.effects:
         words = accepted_text(effect, calibration)
@@ -494,7 +495,7 @@ def certificate_report(certificate: Certificate) -> CertificateReport:
         identity=identity(calibration),
         controller=controller,
         controller_unread=comparison.unread or None,
-        axes=[_certified_gain(row) for row in certificate.rows],
+        axes=[_certified_gain(row) for row in certificate.proposed_rows],
         effects=effects,
         beside=beside,
     )

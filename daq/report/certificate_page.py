@@ -160,7 +160,7 @@ def _gains(certificate: Certificate) -> str:
     compared = certificate.compared_with
     headings = ("axis", compared, "identified ± σ", "change [%]", "limit [%]", "verdict")
     rows = []
-    for gain, row in zip(certificate.calibration.gains, certificate.shown, strict=True):
+    for gain, row in zip(certificate.calibration.gains, certificate.shown_rows, strict=True):
         change = row.change
         compared_gain = f"{change.compared_gain:.5g}"
         identified = f"{with_deviation(gain.value, gain.std)} {gain.unit}"
@@ -195,7 +195,7 @@ def _changes(certificate: Certificate) -> str:
     """Gains beside their limits."""
     compared = certificate.compared_with
     drawn = intervals(
-        [_interval(row) for row in certificate.shown],
+        [_interval(row) for row in certificate.shown_rows],
         "Change of each gain",
         f"from the {compared} [%]",
     )
@@ -310,8 +310,8 @@ def _write(certificate: Certificate) -> str:
     if edit is None:
         return ""
     place = "/".join(edit.file.parts[-2:])
-    if comparison.in_force is not None and certificate.before is not None:
-        previous = {one.axis: one.compared_gain for one in certificate.before.changes}
+    if comparison.in_force is not None and certificate.before_write is not None:
+        previous = {one.axis: one.compared_gain for one in certificate.before_write.changes}
         rows = [
             _written_row(one, previous[one.axis], f"{one.current_gain:.9g}") for one in edit.changes
         ]
@@ -380,7 +380,7 @@ def _since(certificate: Certificate) -> Iterator[str]:
     headings = ("axis", "earlier ± σ", "this one ± σ", "change [%]", "in σ of both", "verdict")
     rows = []
     shifts = []
-    for gain, row in zip(calibration.gains, certificate.since, strict=True):
+    for gain, row in zip(calibration.gains, certificate.rows_since_earlier, strict=True):
         earlier_gain = earlier_gains[gain.axis]
         earlier_text = with_deviation(earlier_gain.value, earlier_gain.std)
         this_text = with_deviation(gain.value, gain.std)

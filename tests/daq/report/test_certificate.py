@@ -555,8 +555,8 @@ def test_gains_that_were_written_are_shown_as_written_beside_the_previous_ones(
         assert "would be written" not in text
         assert "Ready" not in text
     assert texts.count("differs from the previous gain") == 6
-    judged = [row.judged for row in certificate.shown]
-    assert judged == [row.judged for row in ready.rows]
+    judged = [row.judged for row in certificate.shown_rows]
+    assert judged == [row.judged for row in ready.proposed_rows]
     # The comments of this controller file say where the earlier gains came from.
     comment = "J1: “Nm at the joint per A, from the data sheet”"
     with_comment = [text for text in texts if comment in text]
