@@ -226,6 +226,15 @@ def require_count(label: str, value: object, *, remedy: str = "give a number suc
     return int(value)
 
 
+def true_stretches(flags: BoolArray) -> list[tuple[int, int]]:
+    """First index and end of each stretch of set flags, shape (k,), ascending."""
+    # A stretch begins at the even edges and ends at the odd ones.
+    edges = np.flatnonzero(np.diff(flags.astype(np.int8), prepend=0, append=0)).tolist()
+    begins = edges[::2]
+    ends = edges[1::2]
+    return list(zip(begins, ends, strict=True))
+
+
 def takes(
     **kinds: type | UnionType,
 ) -> Callable[[Callable[Arguments, Result]], Callable[Arguments, Result]]:

@@ -10,7 +10,7 @@ from math import ceil
 
 import numpy as np
 
-from ident.arrays import BoolArray, FloatArray, IntArray
+from ident.arrays import BoolArray, FloatArray, IntArray, true_stretches
 from ident.data.conditioning import (
     Conditioning,
     Decimator,
@@ -138,8 +138,7 @@ def _rests(still: BoolArray, shortest: int) -> BoolArray:
     """Samples of each column that are still for so many samples at least, shape (k, m)."""
     found = np.zeros_like(still)
     for own, column in zip(found.T, still.T, strict=True):
-        edges = np.flatnonzero(np.diff(column.astype(np.int8), prepend=0, append=0))
-        for begin, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+        for begin, end in true_stretches(column):
             own[begin:end] = end - begin >= shortest
     return found
 
