@@ -124,6 +124,18 @@ def require_progress(progress: object) -> None:
         )
 
 
+def as_gains(label: str, values: object, count: int) -> FloatArray:
+    """Convert an argument to gains of so many motors, none of them zero; refuse others, as a
+    `ModelError`.
+    """
+    gains = as_array(label, values, (count,), "one per motor")
+    if not gains.all():
+        raise ModelError(
+            f"{label} is {gains.tolist()}; expected no zero: such a motor moves nothing"
+        )
+    return gains
+
+
 def require_names(label: str, names: object, count: int | None = None) -> None:
     """Refuse what is no list of names, one an axis where a count is given, as a `ModelError`.
 

@@ -40,7 +40,12 @@ from ident.data.run_channels import (
     limit_diagnoses,
     still_diagnoses,
 )
-from ident.data.unsigned_current import missing_sign, one_sided_currents, unsigned_currents
+from ident.data.unsigned_current import (
+    missing_sign,
+    one_sided_currents,
+    refuse_unsigned,
+    unsigned_currents,
+)
 from ident.equations.reduction import motor_support
 from ident.equations.rows import motor_columns, rows_of
 from ident.equations.system import System
@@ -632,9 +637,7 @@ def require_explained_currents(
         with suppress(DataUnfit):
             own_errors = np.diag(channel_errors(model, (run,), conditioning))
             unsigned &= ~(100.0 * own_errors <= LARGEST_AXIS_ERROR_PERCENT)
-    if unsigned.any():
-        names = tuple(axis for axis, found in zip(axes, unsigned, strict=True) if found)
-        raise CurrentUnsigned(run.name, names, missing_sign(run.current_a[:, unsigned]))
+    refuse_unsigned(run, unsigned, axes)
 
 
 def unsigned_channels(

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ident.arrays import FloatArray, as_array, require_kind, require_names, takes
+from ident.arrays import FloatArray, as_gains, require_kind, require_names, takes
 from ident.data.conditioning import Conditioning
 from ident.data.dataset import Dataset
 from ident.data.run import Run, SeenRuns, require_named, usual_conditioning
@@ -19,7 +19,7 @@ from ident.equations.observation import observe
 from ident.equations.reduction import reduce_built, regrouped, rows_of_runs
 from ident.equations.rows import Rows, rows_of
 from ident.equations.system import System, require_distinct
-from ident.errors import DataUnfit, IdentificationError, JointStill, ModelError
+from ident.errors import DataUnfit, IdentificationError, JointStill
 from ident.estimators.diagnosis import require_explained_currents
 from ident.estimators.estimate import Estimate, Identification
 from ident.estimators.least_squares import ls, tls, wls
@@ -199,12 +199,7 @@ def _known_gains(fixed_gains: ArrayLike | None, model: Model) -> FloatArray | No
     """Gains that a caller holds fixed, shape (m,); None where they are free."""
     if fixed_gains is None:
         return None
-    gains = as_array("fixed_gains", fixed_gains, (model.robot.axis_count,), "one per motor")
-    if not gains.all():
-        raise ModelError(
-            f"fixed_gains is {gains.tolist()}; expected no zero: such a motor moves nothing"
-        )
-    return gains
+    return as_gains("fixed_gains", fixed_gains, model.robot.axis_count)
 
 
 def _without_limited_currents(

@@ -41,7 +41,7 @@ import numpy as np
 import scipy  # loads its modules when they are first used
 from numpy.typing import ArrayLike
 
-from ident.arrays import FloatArray, IntArray, as_array, require_entries, takes
+from ident.arrays import FloatArray, IntArray, as_gains, require_entries, takes
 from ident.data.conditioning import Conditioning
 from ident.data.run import Run
 from ident.equations.instants import Instants
@@ -308,11 +308,7 @@ def find_turned_geometry(
         of_run.require_axes(model.robot.axis_count)
     if model.is_redundant or not instants:
         return None
-    nameplate = as_array("gains", gains, (model.robot.axis_count,), "one per motor")
-    if not nameplate.all():
-        raise ModelError(
-            f"gains is {nameplate.tolist()}; expected no zero: such a motor moves nothing"
-        )
+    nameplate = as_gains("gains", gains, model.robot.axis_count)
     reference = 1.0 / np.abs(nameplate)
     if not _is_suspect(model, _thinned(instants), reference):
         return None
