@@ -548,15 +548,15 @@ def _tried_on_folds(
     fall_by_motor = fall_of_motors(folds, sums, along, beta)
     fitted_score = (gram @ beta[..., None])[..., 0]
     scatter = cluster_score - fitted_score
-    left_out = _left_out(folds, before, of_motors, sums)
+    training_fall, left_out = _left_out(folds, before, of_motors, sums)
     trials: list[CandidateTrial] = []
     for number in range(len(along)):
         projected = gram[:, number]
         trial = CandidateTrial(
             coefficients=beta[number],
             fall_by_motor=fall_by_motor[number],
-            training_fall=left_out.training_fall[:, number],
-            left_out=left_out.squares[:, :, number],
+            training_fall=training_fall[:, number],
+            left_out=left_out[:, :, number],
             score=score[number],
             scatter=scatter[:, number],
             gram=projected,
@@ -566,22 +566,17 @@ def _tried_on_folds(
     return tuple(trials)
 
 
-@dataclass(frozen=True, slots=True)
-class _LeftOut:
-    """Candidates fitted without each fold k, in a model that is fitted without it, too."""
-
-    training_fall: FloatArray  #: fall of ‖e‖² on the other folds, shape (folds, c)
-    squares: FloatArray  #: ‖r‖² on the fold, shape (folds, m, c)
-
-
 def _left_out(
     folds: Folds, before: FloatArray, of_motors: Sequence[_Products], sums: MotorSums
-) -> _LeftOut:
+) -> tuple[FloatArray, FloatArray]:
     """Fit candidates with J and Φ of the other folds, for each fold k.
 
     There the declared model takes J w_k of the columns, with w_k = H_k⁻¹ J_kᵀΦ_k of the rows that
     are not in the fold. What is left of them, Φ − J w_k, is fitted on these rows, and predicts the
     fold.
+
+    Returns:
+        fall of ‖e‖² on the other folds, shape (folds, c), and ‖r‖² on the fold, (folds, m, c).
     """
     _, count, width, unknowns = sums.jacobian.shape
     # ΦᵀJ, ΦᵀΦ, Φᵀe and Φᵀr of each fold and motor.
@@ -637,7 +632,7 @@ def _left_out(
     squares = before[:, :, None] - 2.0 * linear
     squares += np.einsum("kcp,kncpq,kcq->knc", beta, fold_gram, beta)
     training_fall = np.sum(other_score * beta, axis=-1)
-    return _LeftOut(training_fall, squares)
+    return training_fall, squares
 
 
 def _shortest_inverse(matrices: FloatArray) -> FloatArray:
