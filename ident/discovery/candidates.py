@@ -154,9 +154,7 @@ class SearchProblem:
         """
         return fit_candidates(self.folds, self._whitened(torques))
 
-    def fits_at_rows(
-        self, effects: Iterable[Effect], axis: int
-    ) -> list[tuple[Effect, CandidateFit]]:
+    def fits_at_rows(self, effects: Iterable[Effect], axis: int) -> list[FitAtRows]:
         """Fit effects on an axis by columns built at the rows.
 
         Those that the model contains already, or that cannot be there, are left out.
@@ -164,10 +162,11 @@ class SearchProblem:
         robot = self.model.robot
         placed = [effect for effect in effects if is_placeable(effect, axis, robot)]
         fits = self.fits(self.torque_at_rows(effect, axis) for effect in placed)
-        found: list[tuple[Effect, CandidateFit]] = []
-        for effect, fit in zip(placed, fits, strict=True):
+        shares = shares_explained(self, fits)
+        found: list[FitAtRows] = []
+        for effect, fit, share in zip(placed, fits, shares, strict=True):
             if fit is not None:
-                found.append((effect, fit))
+                found.append(FitAtRows(effect, fit, share))
         return found
 
     def _whitened(self, torques: Iterable[FloatArray]) -> Iterator[tuple[int, WhitenedColumns]]:
@@ -223,6 +222,15 @@ class SearchProblem:
             columns_of_runs.append(as_recorded(run.rate_hz, conditioning, own))
         columns = np.concatenate(columns_of_runs, axis=-1)
         return at_joints(effect, axis, columns, self.model.drive_train)
+
+
+@dataclass(frozen=True, slots=True)
+class FitAtRows:
+    """An effect on an axis, fitted by columns built at the rows."""
+
+    effect: Effect
+    fit: CandidateFit
+    share: float  #: that it explains of the squared residual of its strongest motor
 
 
 @dataclass(frozen=True, slots=True)
