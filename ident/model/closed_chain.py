@@ -184,7 +184,6 @@ def follow(robot: Robot, assembly: Assembly, axes: Motion) -> TreeMotion:
             position are large forces.
     """
     motors = list(robot.axis_joints)
-    x = list(assembly.independent)
     dependent = list(assembly.dependent)
     axes_rad = np.asarray(axes.position_rad, dtype=np.float64)
     samples = len(axes_rad)
@@ -194,22 +193,15 @@ def follow(robot: Robot, assembly: Assembly, axes: Motion) -> TreeMotion:
         return TreeMotion(axes, identity, identity, np.ones(samples))
     position = positions(robot, assembly, axes_rad)
     jacobian = loops(robot, position, assembly.size_m).jacobian
-    # G: the identity in the rows of x, G_d = −R⁻¹ Qᵀ J_x in the others.
-    q, r = np.linalg.qr(jacobian[:, :, dependent])
-    projected_x = np.swapaxes(q, 1, 2) @ jacobian[:, :, x]
-    to_joints = np.zeros((samples, count, len(x)))
-    to_joints[:, x] = np.eye(len(x))
-    to_joints[:, dependent] = -np.linalg.solve(r, projected_x)
+    to_joints, q, r = joints_by_free_ones(assembly, jacobian)
     # ẋ by q̇_a = A ẋ, and q̇ = G ẋ.
     to_motors = to_joints[:, motors]
     velocity_x = _least_squares(to_motors, np.asarray(axes.velocity_rad_s))
     velocity = np.einsum("knd,kd->kn", to_joints, velocity_x)
     # h_d = −R⁻¹ Qᵀ J̇ q̇.
     loop_bias = loops(robot, position, assembly.size_m, velocity).bias  # J̇ q̇
-    projected_bias = np.einsum("kcr,kc->kr", q, loop_bias)
-    bias_of_dependent = np.linalg.solve(r, projected_bias[..., None])
     bias = np.zeros((samples, count))  # h
-    bias[:, dependent] = -bias_of_dependent[..., 0]
+    bias[:, dependent] = -solve_qr(q, r, loop_bias)
     # ẍ by q̈_a = A ẍ + h_a, and q̈ = G ẍ + h.
     axes_without_bias = np.asarray(axes.acceleration_rad_s2) - bias[:, motors]
     acceleration_x = _least_squares(to_motors, axes_without_bias)
@@ -221,6 +213,28 @@ def follow(robot: Robot, assembly: Assembly, axes: Motion) -> TreeMotion:
     _require_regular(robot, axes_rad, condition_of_motors, "motors")
     joints = Motion(position, velocity, acceleration)
     return TreeMotion(joints, to_joints, to_motors, condition)
+
+
+def joints_by_free_ones(
+    assembly: Assembly, jacobian: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return G of q̇ = G ẋ in each sample, shape (k, n, d), with Q and R of J_d.
+
+    It is the identity in the rows of x, and G_d = −R⁻¹ Qᵀ J_x in the others.
+
+    Args:
+        assembly: of the robot.
+        jacobian: of its closures, shape (k, c, n).
+    """
+    x = list(assembly.independent)
+    dependent = list(assembly.dependent)
+    samples, _, joints = jacobian.shape
+    q, r = np.linalg.qr(jacobian[:, :, dependent])
+    projected_x = np.swapaxes(q, 1, 2) @ jacobian[:, :, x]
+    to_joints = np.zeros((samples, joints, len(x)))
+    to_joints[:, x] = np.eye(len(x))
+    to_joints[:, dependent] = -np.linalg.solve(r, projected_x)
+    return to_joints, q, r
 
 
 def _require_regular(robot: Robot, axes_rad: FloatArray, condition: FloatArray, of: str) -> None:
@@ -708,7 +722,11 @@ def _size(robot: Robot, position: FloatArray) -> float:
 
 def _least_squares(matrix: FloatArray, right: FloatArray) -> FloatArray:
     """Solution of A x = b in each sample, shapes (k, m, d) and (k, m); exact for a square A."""
-    q, r = np.linalg.qr(matrix)
-    projected = np.einsum("kmd,km->kd", q, right)  # Qᵀ b
+    return solve_qr(*np.linalg.qr(matrix), right)
+
+
+def solve_qr(q: FloatArray, r: FloatArray, right: FloatArray) -> FloatArray:
+    """Return R⁻¹ Qᵀ b in each sample, shape (k, d), with Q of (k, m, d) and b of (k, m)."""
+    projected = np.einsum("kmd,km->kd", q, right)
     solution = np.linalg.solve(r, projected[..., None])
     return np.asarray(solution[..., 0])
