@@ -69,7 +69,7 @@ from ident.equations.observation import Observation
 from ident.equations.rows import decimate_rows
 from ident.estimators.estimate import Estimate
 from ident.model.model import Model
-from ident.model.robot import Motion
+from ident.model.robot import each_state
 
 ColumnCache = dict[tuple[Effect, int], npt.NDArray[np.float32]]
 """Columns of candidates by effect and axis.
@@ -367,10 +367,11 @@ def _signals_at_rows(run: Signals, data: Dataset, conditioning: Conditioning) ->
     # The arm of a closed chain moves joints that are not axes: it is followed from the axes again.
     arm = run.arm
     if arm is not None:
-        states = (data.position_rad, data.velocity_rad_s, data.acceleration_rad_s2)
         # Samples come first in a dataset, and last in what is decimated.
-        decimated = [decimate_rows(data, conditioning, state.T).T for state in states]
-        arm = replace(arm, motion=Motion(*decimated))
+        decimated = each_state(
+            data.motion(), lambda states: decimate_rows(data, conditioning, states.T).T
+        )
+        arm = replace(arm, motion=decimated)
     return Signals(
         rate_hz=float((len(time_s) - 1) / duration_s),
         inertia_kg_m2=run.inertia_kg_m2[..., :0],

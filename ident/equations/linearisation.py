@@ -423,7 +423,7 @@ def left_out_shifts(grams: FloatArray, scores: FloatArray) -> FloatArray:
         scores: s_c = J_cᵀe_c around the estimate, where they sum to zero, shape (C, f).
     """
     hessian = grams.sum(axis=0)
-    unit = _even_unit(hessian)
+    unit = even_unit(hessian)
     hessians_without = (hessian - grams) * np.outer(unit, unit)
     steps: list[FloatArray] = []
     for matrix, score in zip(hessians_without, scores, strict=True):
@@ -432,10 +432,10 @@ def left_out_shifts(grams: FloatArray, scores: FloatArray) -> FloatArray:
     return -np.stack(steps)
 
 
-def _even_unit(hessian: FloatArray) -> FloatArray:
-    """Units in which the diagonal of H is one, shape (f,): some unknowns are in kg, some in kg m².
+def even_unit(hessian: FloatArray) -> FloatArray:
+    """Return the units in which the diagonal of H is one, shape (f,).
 
-    The factorisation then compares like with like.
+    Some unknowns are in kg, some in kg m²: the factorisation then compares like with like.
     """
     diagonal = np.diag(hessian)
     squares = np.where(diagonal > 0.0, diagonal, 1.0)
@@ -488,7 +488,7 @@ def independent_blocks(grams: FloatArray, scores: FloatArray, runs: IntArray) ->
     """
     starts = np.arange(len(grams))
     hessian = grams.sum(axis=0)
-    unit = _even_unit(hessian)
+    unit = even_unit(hessian)
     scaled = hessian * np.outer(unit, unit)
     scaled[np.diag_indices_from(scaled)] += 1e-9  # a direction that no row shows
     lower = np.linalg.cholesky(scaled)

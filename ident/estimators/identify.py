@@ -16,10 +16,10 @@ from ident.data.run import Run, SeenRuns, require_named, usual_conditioning
 from ident.data.run_channels import RunChannels, channels_of, require_usable_channels
 from ident.equations.instants import Instants, instants_of
 from ident.equations.observation import observe
-from ident.equations.reduction import reduce_built, regrouped, rows_of_runs
+from ident.equations.reduction import reduce_built, regrouped, require_moved, rows_of_runs
 from ident.equations.rows import Rows, rows_of
 from ident.equations.system import System, require_distinct
-from ident.errors import DataUnfit, IdentificationError, JointStill
+from ident.errors import DataUnfit, IdentificationError
 from ident.estimators.diagnosis import require_explained_currents
 from ident.estimators.estimate import Estimate, Identification
 from ident.estimators.least_squares import ls, tls, wls
@@ -248,19 +248,6 @@ def _without_limited_currents(
 
 
 BuiltRun = tuple[Dataset, Sequence[Rows]]  #: A differentiated run and its rows, piece by piece
-
-
-def require_moved(standard: System, axes: Sequence[str]) -> None:
-    """Refuse runs in none of which a joint moves.
-
-    Raises:
-        JointStill: for this joint.
-    """
-    row_counts = standard.joints.rows[: len(axes)]
-    for axis, row_count in enumerate(row_counts):
-        if not row_count:
-            found = f"{axes[axis]} never moves above its standstill speed in any run"
-            raise JointStill(", ".join(standard.runs), (axes[axis],), found)
 
 
 def noting_channels(

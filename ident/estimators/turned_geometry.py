@@ -52,7 +52,7 @@ from ident.estimators.refusals import FRICTION, LARGEST_TOTAL_PERCENT, SMALL_ERR
 from ident.model.base import SMALLEST_COLUMN
 from ident.model.bodies import LINK_PARAMETERS
 from ident.model.model import Model
-from ident.model.robot import JointKind, Motion
+from ident.model.robot import JointKind, Motion, at_rest
 from ident.model.suggested_gravity import suggested_gravity
 
 GRAVITY_TURNED = "gravity-turned"
@@ -1116,9 +1116,7 @@ def gravity_products(
     squares = list[FloatArray]()
     rows = list[IntArray]()
     for one, parts in zip(instants, _parts(instants, part_count), strict=True):
-        position_rad = one.motion.position_rad
-        still = np.zeros_like(position_rad)
-        rest = Motion(position_rad, still, still)
+        rest = at_rest(one.motion.position_rad)
         columns = [_motor_columns(weightless, one, one.motion, mountings)]
         for in_unit_gravity in pulled:
             of_weight = _motor_columns(in_unit_gravity, one, rest, mountings)

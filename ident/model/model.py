@@ -26,7 +26,7 @@ from ident.model.bodies import LINK_PARAMETERS, LINK_UNITS, LOADED
 from ident.model.closed_chain import Assembly, TreeMotion, assemble, follow
 from ident.model.pivots import pivot_motion, pivot_rates
 from ident.model.regressor import fill_rigid, mass_matrix, rigid_torque
-from ident.model.robot import JointKind, Motion, Robot, require_described
+from ident.model.robot import JointKind, Motion, Robot, at_rest, require_described
 
 DRIVE_UNITS = {
     JointKind.REVOLUTE: ("Nm", "rad/s", "kg m²"),
@@ -502,8 +502,7 @@ class Model:
         if not self.robot.is_constrained:
             position = np.ascontiguousarray(position_rad.T)
             return mass_matrix(self.robot, position, links)
-        still = np.zeros_like(position_rad)
-        followed = self.follow(Motion(position_rad, still, still))
+        followed = self.follow(at_rest(position_rad))
         position = np.ascontiguousarray(followed.joints.position_rad.T)
         tree = mass_matrix(self.robot, position, links)
         # M G A⁺ of the joints of the tree: torque per unit of acceleration of each axis

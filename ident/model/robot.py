@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from typing import TYPE_CHECKING, TypeVar
@@ -332,6 +332,21 @@ class Motion:
             value = getattr(self, name)
             if not isinstance(value, np.ndarray):
                 object.__setattr__(self, name, as_array(f"{name} of the motion", value))
+
+
+def each_state(motion: Motion, change: Callable[[FloatArray], FloatArray]) -> Motion:
+    """Return a motion whose positions, velocities and accelerations are changed alike."""
+    return Motion(
+        position_rad=change(motion.position_rad),
+        velocity_rad_s=change(motion.velocity_rad_s),
+        acceleration_rad_s2=change(motion.acceleration_rad_s2),
+    )
+
+
+def at_rest(position_rad: FloatArray) -> Motion:
+    """Return the motion of joints that stay at positions, shape (k, n)."""
+    still = np.zeros_like(position_rad)
+    return Motion(position_rad, still, still)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

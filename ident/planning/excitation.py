@@ -28,7 +28,7 @@ from ident.equations.rows import row_filter, row_masks
 from ident.model.base import BaseParameters, base_parameters
 from ident.model.bodies import LINK_PARAMETERS, Body, Payload
 from ident.model.model import COUPLED_COLUMNS, JOINT_COLUMNS, Model, preload_directions
-from ident.model.robot import Motion, Robot
+from ident.model.robot import Motion, Robot, each_state
 from ident.model.urdf import read_urdf
 from ident.planning.limits import JointLimits
 
@@ -106,11 +106,7 @@ def recorded(model: Model, data: Dataset, conditioning: Conditioning) -> Excitat
     """
     filter_ = row_filter(data, conditioning)
     centres = filter_.centres(len(data.time_s))
-    motion = Motion(
-        position_rad=data.position_rad[centres],
-        velocity_rad_s=data.velocity_rad_s[centres],
-        acceleration_rad_s2=data.acceleration_rad_s2[centres],
-    )
+    motion = each_state(data.motion(), lambda states: states[centres])
     _, motor_use = row_masks(model, data, conditioning)
     return Excitation(motion, motor_use)
 
