@@ -637,11 +637,17 @@ def _independent(free: FloatArray) -> tuple[int, ...]:
     return tuple(sorted(chosen))
 
 
-def null_space(jacobian: FloatArray) -> FloatArray:
-    """Motions of the joints that the closures leave free, shape (n, d)."""
-    _, values, directions = np.linalg.svd(jacobian)
-    smallest = SMALLEST_RANK * values.max(initial=0.0)
-    rank = int(np.sum(values > smallest))
+def null_space(matrix: FloatArray, smallest: float = SMALLEST_RANK) -> FloatArray:
+    """Orthonormal directions that a matrix makes zero, shape (n, d).
+
+    Of the closures' Jacobian, these are the motions of the joints that they leave free.
+
+    Args:
+        matrix: shape (r, n).
+        smallest: singular value, relative to the largest, that is none.
+    """
+    _, values, directions = np.linalg.svd(matrix)
+    rank = int(np.sum(values > smallest * values.max(initial=0.0)))
     return np.asarray(directions[rank:].T)
 
 

@@ -57,6 +57,7 @@ from ident.equations.system import System
 from ident.errors import ModelError
 from ident.estimators.estimate import Estimate
 from ident.model.bodies import link_parameters, pseudo_inertia
+from ident.model.closed_chain import null_space
 from ident.model.model import Model
 from ident.physical.consistency import (
     MARGIN,
@@ -458,10 +459,9 @@ def _loose_drives(system: System, columns: FloatArray, size: float) -> FloatArra
     norms = np.linalg.norm(of_scalars, axis=0)
     if not np.all(norms > 0.0):
         return np.zeros((0, count))
-    _, singular, right = np.linalg.svd(of_scalars / norms, full_matrices=True)
-    rank = int(np.sum(singular > _LOOSE * singular[0]))
-    rows = np.zeros((len(scalars) - rank, count))
-    rows[:, scalars] = right[rank:] * (norms / size)
+    unseen = null_space(of_scalars / norms, _LOOSE).T
+    rows = np.zeros((len(unseen), count))
+    rows[:, scalars] = unseen * (norms / size)
     return rows
 
 
