@@ -147,6 +147,20 @@ class SearchProblem:
         """Test candidates given by joint torques (m, p, r); None where the model contains them."""
         return _scored(self.folds, self._whitened(torques))
 
+    def test_each(
+        self, placed: Iterable[PlacedEffect], torques: Iterable[FloatArray]
+    ) -> tuple[FamilyTrials, ...]:
+        """Test effects, each by itself, by their joint torques (m, p, r).
+
+        Those that the model contains already are left out.
+        """
+        trials = self.trials(torques)
+        tested: list[FamilyTrials] = []
+        for one, trial in zip(placed, trials, strict=True):
+            if trial is not None:
+                tested.append(FamilyTrials(one.axis, ((one.effect, trial),)))
+        return tuple(tested)
+
     def fits(self, torques: Iterable[FloatArray]) -> tuple[CandidateFit | None, ...]:
         """Fit candidates given by joint torques (m, p, r) to all rows, without folds.
 
