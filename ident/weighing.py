@@ -25,11 +25,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ident.arrays import BoolArray, FloatArray, IntArray, require_kind, takes
+from ident.arrays import BoolArray, FloatArray, IntArray, takes
 from ident.calibration import Calibration
 from ident.data.conditioning import Conditioning
 from ident.data.dataset import Dataset, differentiate
-from ident.data.run import Run
+from ident.data.run import Run, require_entry
 from ident.effects.effect import PlacedEffect, effect_torque
 from ident.effects.geometry_corrections import corrected_dataset, corrected_model
 from ident.effects.rotor import beside_rotors
@@ -269,9 +269,7 @@ def rows_to_weigh(
     def prepared(runs: Iterable[Run]) -> list[Dataset]:
         made: list[Dataset] = []
         for run in runs:
-            require_kind(
-                "an entry of the runs", run, Run, "write Run(name, time_s, position_rad, current_a)"
-            )
+            require_entry(run)
             without_payload = replace(run, payload=None)
             made.append(differentiate(without_payload, model.drive_train, conditioning))
         return made

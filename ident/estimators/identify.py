@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from ident.arrays import FloatArray, as_gains, require_kind, require_names, takes
 from ident.data.conditioning import Conditioning
 from ident.data.dataset import Dataset
-from ident.data.run import Run, SeenRuns, require_named, usual_conditioning
+from ident.data.run import Run, SeenRuns, require_entry, require_named, usual_conditioning
 from ident.data.run_channels import RunChannels, channels_of, require_usable_channels
 from ident.equations.instants import Instants, instants_of
 from ident.equations.observation import observe
@@ -301,9 +301,7 @@ def each_run(
     """
     require_kind("runs or holdout", runs, Iterable, "give a list: [bare, loaded]")
     for run in runs:
-        require_kind(
-            "an entry of the runs", run, Run, "write Run(name, time_s, position_rad, current_a)"
-        )
+        require_entry(run)
         require_named(run)
         seen.add(run)
         if run.payload is not None and payloads is not None:

@@ -12,7 +12,7 @@ in no equation: the columns are then those of the least τ without it,
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from hashlib import blake2b
 from typing import TYPE_CHECKING
@@ -261,6 +261,10 @@ class Model:
         count = len(self.drive_train.coupled)
         return first + COUPLED_COLUMNS * np.arange(count)
 
+    def _each_coupled(self) -> Iterable[tuple[int, int]]:
+        """Each motor that turns with several joints, and its first column."""
+        return zip(self.drive_train.coupled, self._coupled_columns.tolist(), strict=True)
+
     @property
     def coupled_dry_friction_columns(self) -> IntArray:
         """Column of fsm of each motor that turns with several joints, shape (coupled,)."""
@@ -315,9 +319,7 @@ class Model:
                 out[joint, own] = True
                 joint = self.robot.joints[joint].parent
         direction = self.drive_train.direction
-        for motor, first in zip(
-            self.drive_train.coupled, self._coupled_columns.tolist(), strict=True
-        ):
+        for motor, first in self._each_coupled():
             is_turned = direction[motor] != 0.0
             out[:, first : first + COUPLED_COLUMNS] = is_turned[:, None]
         if self.friction_by_payload:
@@ -411,9 +413,7 @@ class Model:
             own[OFFSET] = 1.0
         direction = self.drive_train.direction
         motor_speed = direction @ velocity[axes]
-        for motor, first in zip(
-            self.drive_train.coupled, self._coupled_columns.tolist(), strict=True
-        ):
+        for motor, first in self._each_coupled():
             r = direction[motor]
             cross = _off_diagonal(r)
             out[axes, first] = cross @ acceleration[axes]
@@ -474,9 +474,7 @@ class Model:
         total += geared
         total += offset
         direction = self.drive_train.direction
-        for motor, first in zip(
-            self.drive_train.coupled, self._coupled_columns.tolist(), strict=True
-        ):
+        for motor, first in self._each_coupled():
             inertia, viscous, dry = standard[first : first + COUPLED_COLUMNS]
             r = direction[motor]
             smooth = _off_diagonal(r) @ (inertia * acceleration + viscous * velocity)

@@ -407,3 +407,11 @@ def skew(vector: FloatArray) -> FloatArray:
     """Matrix of the cross product with a vector, shape (3, 3)."""
     x, y, z = vector
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+def turned_about(axis: FloatArray, angle_rad: float) -> FloatArray:
+    """Rotation by an angle about a unit vector, shape (3, 3): Rodrigues' formula."""
+    cross = skew(axis)
+    sine = np.sin(angle_rad)
+    one_less_cosine = 1.0 - np.cos(angle_rad)
+    return np.asarray(np.eye(3) + sine * cross + one_less_cosine * (cross @ cross))

@@ -56,7 +56,7 @@ from ident.arrays import FloatArray
 from ident.equations.system import System
 from ident.errors import ModelError
 from ident.estimators.estimate import Estimate
-from ident.model.bodies import link_parameters, pseudo_inertia
+from ident.model.bodies import link_parameters, pseudo_factors, pseudo_inertia
 from ident.model.closed_chain import null_space
 from ident.model.model import Model
 from ident.physical.consistency import (
@@ -110,8 +110,7 @@ class LinkPrior:
     @property
     def factors(self) -> FloatArray:
         """L of each link, shape (n, 4, 4)."""
-        pseudo_inertias = np.array([pseudo_inertia(link) for link in self.links])
-        return np.linalg.cholesky(pseudo_inertias)
+        return pseudo_factors(self.links)
 
     def directions(self) -> FloatArray:
         """Change of each link's ten parameters for one σ of ten independent numbers.

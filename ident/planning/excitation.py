@@ -26,7 +26,7 @@ from ident.data.dataset import Dataset
 from ident.equations.currents import whitening_transform
 from ident.equations.rows import row_filter, row_masks
 from ident.model.base import BaseParameters, base_parameters
-from ident.model.bodies import LINK_PARAMETERS, Body, Payload
+from ident.model.bodies import LINK_PARAMETERS, Body, Payload, steiner
 from ident.model.model import COUPLED_COLUMNS, JOINT_COLUMNS, Model, preload_directions
 from ident.model.robot import Motion, Robot, each_state
 from ident.model.urdf import read_urdf
@@ -472,8 +472,7 @@ def nominal_links(robot: Robot, urdf: str | None) -> tuple[FloatArray, bool]:
 def _rod(rod_m: FloatArray) -> Body:
     """A rod of LINK_MASS_KG from the origin to a point."""
     # m/12 (‖r‖² 1 − r rᵀ), and m R²/2 for its radius R
-    across = rod_m @ rod_m * np.eye(3) - np.outer(rod_m, rod_m)
-    slender = LINK_MASS_KG / 12.0 * across
+    slender = LINK_MASS_KG / 12.0 * steiner(rod_m)
     thick = 0.5 * LINK_MASS_KG * ROD_RADIUS_M**2 * np.eye(3)
     return Body(LINK_MASS_KG, 0.5 * rod_m, slender + thick)
 
