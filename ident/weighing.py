@@ -42,7 +42,7 @@ from ident.equations.triangles import solve
 from ident.errors import DataUnfit
 from ident.estimators.estimate import RelativeError, relative_error
 from ident.model.base import base_parameters
-from ident.model.bodies import LINK_PARAMETERS, LINK_UNITS
+from ident.model.bodies import LINK_PARAMETERS, LINK_UNITS, steiner
 from ident.model.model import Column, Model
 from ident.model.robot import Place
 from ident.planning.excitation import UNSEEN, side_of_cube
@@ -212,13 +212,9 @@ def _centre(body: FloatArray) -> FloatArray:
 def _about_centre(body: FloatArray) -> FloatArray:
     # I − (‖c‖² 1 − c cᵀ)/m, c the first moments
     inertia = body[:6]
-    x, y, z = body[6:9]
+    moved = steiner(body[6:9])[np.triu_indices(3)]
     mass = body[9]
-    xx = x * x
-    yy = y * y
-    zz = z * z
-    steiner = np.array([yy + zz, -x * y, -x * z, xx + zz, -y * z, xx + yy])
-    return np.asarray(inertia - steiner / mass)
+    return np.asarray(inertia - moved / mass)
 
 
 @takes(

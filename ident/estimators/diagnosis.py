@@ -68,7 +68,7 @@ from ident.estimators.refusals import (
     joint_torques,
     numbers_text,
     refuse_mistakes,
-    weight_ratio,
+    weight_off,
     with_channel_causes,
 )
 from ident.model.model import Model
@@ -266,12 +266,10 @@ def judged_estimate(system: System, estimate: Estimate) -> Estimate:
 
 def weight_diagnoses(system: System, estimate: Estimate) -> Iterator[Diagnosis]:
     """Compare the weight of the payload by fixed gains with the declared one."""
-    if not estimate.gains_fixed or not system.knows_payload:
+    if not estimate.gains_fixed:
         return
-    ratio, std = weight_ratio(system, estimate)
-    is_too_heavy = ratio - std > WEIGHT_RATIO
-    is_too_light = ratio + std < 1.0 / WEIGHT_RATIO
-    if not is_too_heavy and not is_too_light:
+    ratio = weight_off(system, estimate, WEIGHT_RATIO)
+    if ratio is None:
         return
     loaded = {run for run, mounting in system.cluster_runs if mounting >= 0}
     runs = tuple(system.runs[run] for run in sorted(loaded))
