@@ -18,7 +18,6 @@ from ident.data.conditioning import Conditioning, current_rows
 from ident.data.dataset import Dataset, differentiate
 from ident.data.run import Run
 from ident.equations.rows import row_masks
-from ident.errors import ModelError
 from ident.model.model import Model
 from ident.model.robot import Motion, each_state
 
@@ -48,17 +47,13 @@ class Instants:
         position_rad = as_array("position_rad of the instants", self.motion.position_rad)
         rows = len(np.atleast_1d(position_rad))
         expected = {
+            "position_rad": (position_rad, (rows, count)),
             "current_a": (self.current_a, (count, rows)),
             "use": (self.use, (count, rows)),
             "move": (self.move, (rows,)),
         }
         for name, (values, shape) in expected.items():
             as_array(f"{name} of the instants", values, shape, remedy)
-        if position_rad.shape != (rows, count):
-            raise ModelError(
-                f"position_rad of the instants has shape {position_rad.shape}; expected "
-                f"({rows}, {count}); {remedy}"
-            )
 
     def every(self, step: int) -> Instants:
         """Every so many of the rows."""
