@@ -124,6 +124,18 @@ def require_progress(progress: object) -> None:
         )
 
 
+def as_gains(label: str, values: object, count: int) -> FloatArray:
+    """Convert an argument to gains of so many motors, none of them zero; refuse others, as a
+    `ModelError`.
+    """
+    gains = as_array(label, values, (count,), "one per motor")
+    if not gains.all():
+        raise ModelError(
+            f"{label} is {gains.tolist()}; expected no zero: such a motor moves nothing"
+        )
+    return gains
+
+
 def require_names(label: str, names: object, count: int | None = None) -> None:
     """Refuse what is no list of names, one an axis where a count is given, as a `ModelError`.
 
@@ -224,6 +236,15 @@ def require_count(label: str, value: object, *, remedy: str = "give a number suc
             f"{label} is {value!r:.60}; expected a whole number, zero or above; {remedy}"
         )
     return int(value)
+
+
+def true_stretches(flags: BoolArray) -> list[tuple[int, int]]:
+    """First index and end of each stretch of set flags, shape (k,), ascending."""
+    # A stretch begins at the even edges and ends at the odd ones.
+    edges = np.flatnonzero(np.diff(flags.astype(np.int8), prepend=0, append=0)).tolist()
+    begins = edges[::2]
+    ends = edges[1::2]
+    return list(zip(begins, ends, strict=True))
 
 
 def takes(

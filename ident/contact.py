@@ -46,7 +46,6 @@ from ident.arrays import (
     FloatArray,
     IntArray,
     as_array,
-    require_kind,
     require_number,
     require_real,
     takes,
@@ -54,8 +53,8 @@ from ident.arrays import (
 from ident.calibration import Calibration
 from ident.data.conditioning import Conditioning, as_recorded
 from ident.data.dataset import differentiate
-from ident.data.run import Run
-from ident.equations.rows import row_filter, row_masks
+from ident.data.run import Run, require_entry
+from ident.equations.rows import require_any_row, row_filter, row_masks
 from ident.errors import DataUnfit, ModelError
 from ident.model.model import Model
 from ident.prediction import measured_torque, predict_torque
@@ -262,16 +261,11 @@ def prediction_band(
 def _residual(
     calibration: Calibration, model: Model, run: Run, conditioning: Conditioning
 ) -> _Residual:
-    require_kind(
-        "an entry of the runs", run, Run, "write Run(name, time_s, position_rad, current_a)"
-    )
+    require_entry(run)
     data = differentiate(run, model.drive_train, conditioning)
     filter_ = row_filter(data, conditioning)
     use, _ = row_masks(model, data, conditioning)
-    if not use.any():
-        raise DataUnfit(
-            data.name, "no row is left after the standstill and validity masks; did the robot move?"
-        )
+    require_any_row(data, use)
     needed_nm = predict_torque(calibration, model, data).T
     predicted = as_recorded(data.rate_hz, conditioning, needed_nm)
     measured = measured_torque(calibration, model, data.current_a, data.motion()).T

@@ -25,11 +25,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ident.arrays import BoolArray, FloatArray, IntArray, require_kind, takes
+from ident.arrays import BoolArray, FloatArray, IntArray, takes
 from ident.calibration import Calibration
 from ident.data.conditioning import Conditioning
 from ident.data.dataset import Dataset, differentiate
-from ident.data.run import Run
+from ident.data.run import Run, require_entry
 from ident.effects.effect import PlacedEffect, effect_torque
 from ident.effects.geometry_corrections import corrected_dataset, corrected_model
 from ident.effects.rotor import beside_rotors
@@ -42,7 +42,7 @@ from ident.equations.triangles import solve
 from ident.errors import DataUnfit
 from ident.estimators.estimate import RelativeError, relative_error
 from ident.model.base import base_parameters
-from ident.model.bodies import LINK_PARAMETERS, LINK_UNITS
+from ident.model.bodies import LINK_PARAMETERS, LINK_UNITS, steiner
 from ident.model.model import Column, Model
 from ident.model.robot import Place
 from ident.planning.excitation import UNSEEN, side_of_cube
@@ -212,13 +212,9 @@ def _centre(body: FloatArray) -> FloatArray:
 def _about_centre(body: FloatArray) -> FloatArray:
     # I − (‖c‖² 1 − c cᵀ)/m, c the first moments
     inertia = body[:6]
-    x, y, z = body[6:9]
+    moved = steiner(body[6:9])[np.triu_indices(3)]
     mass = body[9]
-    xx = x * x
-    yy = y * y
-    zz = z * z
-    steiner = np.array([yy + zz, -x * y, -x * z, xx + zz, -y * z, xx + yy])
-    return np.asarray(inertia - steiner / mass)
+    return np.asarray(inertia - moved / mass)
 
 
 @takes(
@@ -269,9 +265,7 @@ def rows_to_weigh(
     def prepared(runs: Iterable[Run]) -> list[Dataset]:
         made: list[Dataset] = []
         for run in runs:
-            require_kind(
-                "an entry of the runs", run, Run, "write Run(name, time_s, position_rad, current_a)"
-            )
+            require_entry(run)
             without_payload = replace(run, payload=None)
             made.append(differentiate(without_payload, model.drive_train, conditioning))
         return made

@@ -18,7 +18,13 @@ from enum import Enum
 import numpy as np
 
 from ident.arrays import BoolArray, FloatArray, IntArray
-from ident.data.frozen import clipped_position, frozen_current, frozen_position, frozen_to_the_end
+from ident.data.frozen import (
+    clipped_position,
+    frozen_current,
+    frozen_position,
+    frozen_to_the_end,
+    usual_step,
+)
 from ident.data.glitches import Jumps, Readings, find_jumps, is_split, smallest_change, wrap_size
 from ident.data.held import fill_damaged, longest_cubic_fill, samples_to_fill
 
@@ -28,7 +34,6 @@ LOST_PLACE = 3.0
 """Least step of a position after which it does not return,
 in multiples of its largest usual step.
 """
-USUAL_PERCENTILE = 99.0  #: Of the steps of a position
 MOTOR_UNIT = "rad of the motor"
 JOINT_UNIT = "rad or m of the joint"
 ROUNDED_DIGITS = 12  #: Of a position that is computed of several joints, as a share of its largest
@@ -427,11 +432,7 @@ def _lost_place(readings: Readings, jumps: Jumps, frozen: IntArray) -> BoolArray
     """Steps after which a position goes on displaced, shape (s,),
     without those at the ends of frozen stretches.
     """
-    steps = np.abs(np.diff(readings.values))
-    usual = 0.0
-    if len(steps):
-        usual = float(np.percentile(steps, USUAL_PERCENTILE))
-    is_large = np.abs(jumps.step_size) > LOST_PLACE * usual
+    is_large = np.abs(jumps.step_size) > LOST_PLACE * usual_step(readings)
     leaves_frozen = np.isin(readings.sample[jumps.step] + 1, frozen)
     enters_frozen = np.isin(readings.sample[jumps.step + 1], frozen)
     return np.asarray(is_large & ~(leaves_frozen | enters_frozen))

@@ -364,21 +364,18 @@ def standstill_speed(
     impulse[0, impulse.shape[1] // 2] = 1.0
     response = low_pass(impulse, rate_hz, cutoff_hz, conditioning.position_order)
     removed = float(np.linalg.norm(impulse - response))
-    remaining_rate = float(np.linalg.norm(_differences(response, rate_hz)))
+    _, rate, _ = central_differences(response, rate_hz)
+    remaining_rate = float(np.linalg.norm(rate))
     removed_noise = np.median(np.abs(raw - smooth), axis=1)
     noise = removed_noise / MEDIAN_OF_NORMAL / removed
     # A joint that stands exactly still has rounding noise alone.
     largest = np.maximum(np.abs(raw).max(axis=1), 1.0)
     noise = np.maximum(noise, 1e-12 * largest)
-    speed = np.quantile(np.abs(_differences(smooth, rate_hz)), 0.95, axis=1)
+    _, velocity, _ = central_differences(smooth, rate_hz)
+    speed = np.quantile(np.abs(velocity), 0.95, axis=1)
     by_speed = STANDSTILL_SHARE_OF_SPEED * speed
     by_noise = STANDSTILL_SIGMAS * remaining_rate * noise
     return np.asarray(np.maximum(by_speed, by_noise))
-
-
-def _differences(values: FloatArray, rate_hz: float) -> FloatArray:
-    """Central differences, shape (c, k) → (c, k − 2)."""
-    return 0.5 * rate_hz * (values[:, 2:] - values[:, :-2])
 
 
 @takes(motion=Motion, payload=Payload | None)

@@ -22,7 +22,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from ident.arrays import BoolArray, FloatArray
+from ident.arrays import BoolArray, FloatArray, true_stretches
 from ident.data.conditioning import Conditioning, low_pass
 from ident.data.dataset import Dataset
 from ident.model.model import DriveTrain
@@ -304,7 +304,7 @@ def _rests(position: FloatArray, is_slow: BoolArray, shortest: int) -> list[_Res
         shortest: samples of the shortest rest.
     """
     stretches: list[tuple[int, int]] = []
-    for first, end in _true_stretches(is_slow):
+    for first, end in true_stretches(is_slow):
         if end - first >= shortest:
             stretches.append((first, end))
     count = len(is_slow)
@@ -321,16 +321,6 @@ def _rests(position: FloatArray, is_slow: BoolArray, shortest: int) -> list[_Res
             rest = replace(before, end=end)
         rests.append(rest)
     return rests
-
-
-def _true_stretches(mask: BoolArray) -> list[tuple[int, int]]:
-    """First index and end of each stretch of a mask that is true."""
-    padded = np.concatenate(([False], mask, [False])).astype(np.int8)
-    # Edges alternate: a stretch begins at the even ones and ends at the odd ones.
-    edges = np.flatnonzero(np.diff(padded)).tolist()
-    begins = edges[::2]
-    ends = edges[1::2]
-    return list(zip(begins, ends, strict=True))
 
 
 def _fit_moves(position: FloatArray, stops: Sequence[_Stop], rate_hz: float) -> FloatArray:

@@ -38,6 +38,14 @@ LEAST_TURNS = 2  #: Changes of direction that show how gently a motor slows down
 LATER_S = 0.5  #: Time after a stop in which other motors may still come to rest with it
 
 
+def usual_step(readings: Readings) -> float:
+    """The largest usual step of a position; zero without any."""
+    steps = np.abs(np.diff(readings.values))
+    if not len(steps):
+        return 0.0
+    return float(np.percentile(steps, STEP_PERCENTILE))
+
+
 def frozen_position(readings: Readings) -> IntArray:
     """Stretches in which a position is frozen, as first sample and end, shape (s, 2).
 
@@ -45,9 +53,7 @@ def frozen_position(readings: Readings) -> IntArray:
         readings: of a motor's position.
     """
     steps = np.abs(np.diff(readings.values))
-    usual = 0.0
-    if len(steps):
-        usual = float(np.percentile(steps, STEP_PERCENTILE))
+    usual = usual_step(readings)
     if not usual > 0.0:
         return _no_stretch()  # nothing says how fast it moves
     smallest_jump = JUMP * usual + ABRUPT_COUNTS * readings.count

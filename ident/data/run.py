@@ -117,6 +117,16 @@ class Run:
         return float((len(self.time_s) - 1) / (self.time_s[-1] - self.time_s[0]))
 
 
+def require_entry(run: Run) -> None:
+    """Refuse an entry of a list of runs that is no run.
+
+    Raises:
+        ModelError: for the entry.
+    """
+    remedy = "write Run(name, time_s, position_rad, current_a)"
+    require_kind("an entry of the runs", run, Run, remedy)
+
+
 def require_named(run: Run) -> None:
     """Refuse a run with a field of another type that is no array, before a message or a report
     uses it.

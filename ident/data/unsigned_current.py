@@ -53,7 +53,15 @@ def require_signed_currents(run: Run, ratio: FloatArray, axes: Sequence[str]) ->
         CurrentUnsigned: a current is never of the other sign, and comes down to zero again and
             again, while its motor turns both ways.
     """
-    unsigned = unsigned_currents(run, ratio)
+    refuse_unsigned(run, unsigned_currents(run, ratio), axes)
+
+
+def refuse_unsigned(run: Run, unsigned: BoolArray, axes: Sequence[str]) -> None:
+    """Refuse a recording if some of its currents, shape (n,), are sizes.
+
+    Raises:
+        CurrentUnsigned: for these currents.
+    """
     if unsigned.any():
         names = tuple(axis for axis, found in zip(axes, unsigned, strict=True) if found)
         raise CurrentUnsigned(run.name, names, missing_sign(run.current_a[:, unsigned]))

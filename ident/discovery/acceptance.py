@@ -128,7 +128,7 @@ def _fitted_again(start: Evidence, found: Evidence, kept: Evidence) -> JointFit:
     if kept is start:
         refitted = start
     else:
-        refitted = replace(with_effects(found, kept.effects), declared=found.declared)
+        refitted = with_effects(found, kept.effects)
     return linearised(refitted, ColumnCache())
 
 

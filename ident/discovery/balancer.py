@@ -8,11 +8,11 @@ together with the grid, which represents the search over them.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 
-from ident.discovery.candidates import SearchProblem, shares_explained
+from ident.discovery.candidates import SearchProblem
 from ident.discovery.gates import Gates
-from ident.discovery.refinement import is_strictly_possible, refine_together
+from ident.discovery.refinement import best_of_each, refine_together
 from ident.effects.effect import Effect
 from ident.effects.position import Counterbalance
 
@@ -44,26 +44,10 @@ def propose_balancers(
         if not tried:  # gravity's parameters hold the spring's share
             bare = [effect.with_settings({"with_spring": 0}) for effect in grid]
             tried = search_problem.fits_at_rows(bare, axis)
-        shares = shares_explained(search_problem, [fit for _, fit in tried])
-        found: list[tuple[float, Effect]] = []
-        for share, (effect, fit) in zip(shares, tried, strict=True):
-            if share >= gates.smallest_share and is_strictly_possible(effect, fit):
-                found.append((share, effect))
-        found.sort(key=lambda one: -one[0])
-        members = [effect for _, effect in found]
-        refined = [refine_together(search_problem, start, axis) for start in _apart(members)]
+        enough = [one for one in tried if one.share >= gates.smallest_share]
+        starts = best_of_each(enough, "phase_rad", STARTS)
+        refined = [refine_together(search_problem, start, axis) for start in starts]
         if refined:
-            grid_effects = [effect for effect, _ in tried]
+            grid_effects = [one.effect for one in tried]
             proposed[axis] = ((*grid_effects, *refined),)
     return proposed
-
-
-def _apart(members: Sequence[Effect]) -> tuple[Effect, ...]:
-    """The best member of each of STARTS directions of the lever.
-
-    The simplex does not find the way from one direction to another.
-    """
-    best: dict[float, Effect] = {}
-    for member in members:
-        best.setdefault(member.settings["phase_rad"], member)
-    return tuple(best.values())[:STARTS]

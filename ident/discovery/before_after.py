@@ -435,26 +435,21 @@ def account(
     left_a = left_on(end.after.training, end.after.estimate)
     progress("time skew by instruments from the demanded motion")
     skew = time_skew(end.after)
-    known: list[MotorNoiseFloor | None] = []
-    least: list[MotorNoiseFloor | None] = []
-    for floor, left in zip(floors, left_a, strict=True):
-        if floor is None or floor.is_refuted(left):
-            known.append(None)
-            least.append(None)
+    known_a = np.full(len(floors), np.nan)
+    least_a = np.full(len(floors), np.nan)
+    for motor, floor in enumerate(floors):
+        if floor is None or floor.is_refuted(left_a[motor]):
             continue
-        known.append(floor)
+        known_a[motor] = floor.noise_a
         if floor.is_bound:
-            least.append(replace(floor, noise_a=floor.least_a))
-        else:
-            least.append(None)
+            least_a[motor] = floor.least_a
 
-    def error_of(
-        noises: Sequence[MotorNoiseFloor | None], before: Observation, after: Observation
-    ) -> RelativeError:
+    def error_of(noise_a: FloatArray, before: Observation, after: Observation) -> RelativeError:
         """Error by noise alone on some rows; a model that leaves less by chance is at the floor."""
         left_before = left_on(before, start.estimate)
         left_after = left_on(after, end.after.estimate)
-        at_most = capped(noises, np.fmin(left_before, left_after))
+        at_most = np.fmin(noise_a, np.fmin(left_before, left_after))
+        at_most[np.isnan(noise_a)] = np.nan
         return floor_on(before, start.estimate, at_most).relative(weights_nm_a)
 
     training = start.training
@@ -463,14 +458,14 @@ def account(
     least_holdout_floor: RelativeError | None = None
     if start.holdout is not None:
         holdout_after = end.after.holdout or start.holdout
-        holdout_floor = error_of(known, start.holdout, holdout_after)
-        least_holdout_floor = error_of(least, start.holdout, holdout_after)
+        holdout_floor = error_of(known_a, start.holdout, holdout_after)
+        least_holdout_floor = error_of(least_a, start.holdout, holdout_after)
     return Account(
         floors=floors,
         left_a=left_a,
-        floor=error_of(known, training, training_after),
+        floor=error_of(known_a, training, training_after),
         holdout_floor=holdout_floor,
-        least_floor=error_of(least, training, training_after),
+        least_floor=error_of(least_a, training, training_after),
         least_holdout_floor=least_holdout_floor,
         turns=tuple(turns),
         total=before_after(first, last),
@@ -553,35 +548,12 @@ def before_after(before: Assessment, after: Assessment) -> BeforeAfter:
     )
 
 
-def capped(
-    floors: Sequence[MotorNoiseFloor | None], left_a: FloatArray
-) -> tuple[MotorNoiseFloor | None, ...]:
-    """Lower each floor to what a model leaves on the rows that it is shown for.
-
-    Args:
-        floors: of each motor.
-        left_a: root mean square of the error of each motor [A], shape (m,).
+def floor_on(observation: Observation, estimate: Estimate, noise_a: FloatArray) -> CurrentError:
+    """Error that noise alone would leave on some rows, by that of each motor [A], shape (m,);
+    NaN for a motor whose noise is not known.
     """
-    lowered: list[MotorNoiseFloor | None] = []
-    for floor, left in zip(floors, left_a, strict=True):
-        if floor is None:
-            lowered.append(None)
-        else:
-            noise_a = float(np.fmin(floor.noise_a, left))
-            lowered.append(replace(floor, noise_a=noise_a))
-    return tuple(lowered)
-
-
-def floor_on(
-    observation: Observation, estimate: Estimate, floors: Sequence[MotorNoiseFloor | None]
-) -> CurrentError:
-    """Error that noise alone would leave on some rows; NaN for a motor whose noise is not known."""
     use = observation.motor_use
     seen = _currents(observation, estimate)
-    noise_a = np.full(len(floors), np.nan)
-    for motor, floor in enumerate(floors):
-        if floor is not None:
-            noise_a[motor] = floor.noise_a
     size = np.sum(seen.measured**2, axis=1, where=use)
     rows = np.sum(seen.shown, axis=1, where=use)
     return CurrentError(size, rows * noise_a**2)

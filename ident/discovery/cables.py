@@ -8,16 +8,15 @@ with all that were tried, which represent the search.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from itertools import chain
 
 import numpy as np
 
 from ident.arrays import FloatArray
-from ident.discovery.candidate_fits import CandidateFit
-from ident.discovery.candidates import SearchProblem, shares_explained
+from ident.discovery.candidates import FitAtRows, SearchProblem
 from ident.discovery.gates import Gates
-from ident.discovery.refinement import is_strictly_possible, refine_together
+from ident.discovery.refinement import best_of_each, refine_together
 from ident.effects.effect import Effect, is_placeable
 from ident.effects.position import AlongTwoJoints, SlackCable
 
@@ -29,8 +28,6 @@ STARTS = 3  #: From which direction and start are fitted
 LEAST_SLACK = 0.05
 #: Of a direction from a joint's own, below which a cable is a `Hinge` of that joint
 ONE_JOINT_RAD = 0.15
-
-Tried = tuple[Effect, CandidateFit]
 
 
 def propose_cables(
@@ -49,32 +46,30 @@ def propose_cables(
     grid = next((family for family in cables if isinstance(family[0], SlackCable)), ())
     if not grid or search_problem.folds.moves < grid[0].least_moves:
         return {}
-    found: list[tuple[float, int, Effect]] = []
+    found: list[tuple[int, FitAtRows]] = []
     for axis in range(search_problem.axes):
-        tried = search_problem.fits_at_rows(chain.from_iterable(cables), axis)
-        shares = shares_explained(search_problem, [fit for _, fit in tried])
-        for share, (effect, _) in zip(shares, tried, strict=True):
-            found.append((share, axis, effect))
+        for one in search_problem.fits_at_rows(chain.from_iterable(cables), axis):
+            found.append((axis, one))
     if not found:
         return {}
-    share, axis, best = max(found, key=lambda one: one[0])
-    if share < gates.smallest_share:
+    axis, best = max(found, key=lambda one: one[1].share)
+    if best.share < gates.smallest_share:
         return {}
-    other_axis = int(best.settings["other_axis"])
+    other_axis = int(best.effect.settings["other_axis"])
     tried = _tried(search_problem, axis, other_axis)
     refined: list[Effect] = []
-    for effect in _best_of(search_problem, tried):
+    for effect in best_of_each(tried, "direction_rad", STARTS):
         fitted = refine_together(search_problem, effect, axis)
         if isinstance(fitted, SlackCable) and _is_slack_cable(search_problem, fitted, axis):
             refined.append(fitted)
     robot = search_problem.model.robot
     shared = [effect for effect in grid if is_placeable(effect, axis, robot)]
-    tried_effects = [effect for effect, _ in tried]
+    tried_effects = [one.effect for one in tried]
     family = (*shared, *tried_effects, *refined)
     return {axis: (family,)}
 
 
-def _tried(search_problem: SearchProblem, axis: int, other_axis: int) -> list[Tried]:
+def _tried(search_problem: SearchProblem, axis: int, other_axis: int) -> list[FitAtRows]:
     """Slack cables on a pair of joints that the model does not contain, with their fits."""
     effects: list[SlackCable] = []
     step_rad = 2.0 * np.pi / DIRECTIONS
@@ -103,19 +98,3 @@ def _is_slack_cable(search_problem: SearchProblem, cable: SlackCable, axis: int)
     quarter_turns = cable.direction_rad / (np.pi / 2.0)
     from_one_joint_rad = abs(quarter_turns - round(quarter_turns)) * np.pi / 2.0
     return from_one_joint_rad >= ONE_JOINT_RAD
-
-
-def _best_of(search_problem: SearchProblem, tried: Sequence[Tried]) -> tuple[Effect, ...]:
-    """The best possible cable of each of the best directions.
-
-    The simplex does not find the way from one direction to another.
-    """
-    shares = shares_explained(search_problem, [fit for _, fit in tried])
-    possible: list[tuple[float, Effect]] = []
-    for share, (effect, fit) in zip(shares, tried, strict=True):
-        if is_strictly_possible(effect, fit):
-            possible.append((share, effect))
-    best: dict[float, Effect] = {}
-    for _, effect in sorted(possible, key=lambda one: -one[0]):
-        best.setdefault(effect.settings["direction_rad"], effect)
-    return tuple(best.values())[:STARTS]

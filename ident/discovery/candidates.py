@@ -69,7 +69,7 @@ from ident.equations.observation import Observation
 from ident.equations.rows import decimate_rows
 from ident.estimators.estimate import Estimate
 from ident.model.model import Model
-from ident.model.robot import Motion
+from ident.model.robot import each_state
 
 ColumnCache = dict[tuple[Effect, int], npt.NDArray[np.float32]]
 """Columns of candidates by effect and axis.
@@ -147,6 +147,20 @@ class SearchProblem:
         """Test candidates given by joint torques (m, p, r); None where the model contains them."""
         return _scored(self.folds, self._whitened(torques))
 
+    def test_each(
+        self, placed: Iterable[PlacedEffect], torques: Iterable[FloatArray]
+    ) -> tuple[FamilyTrials, ...]:
+        """Test effects, each by itself, by their joint torques (m, p, r).
+
+        Those that the model contains already are left out.
+        """
+        trials = self.trials(torques)
+        tested: list[FamilyTrials] = []
+        for one, trial in zip(placed, trials, strict=True):
+            if trial is not None:
+                tested.append(FamilyTrials(one.axis, ((one.effect, trial),)))
+        return tuple(tested)
+
     def fits(self, torques: Iterable[FloatArray]) -> tuple[CandidateFit | None, ...]:
         """Fit candidates given by joint torques (m, p, r) to all rows, without folds.
 
@@ -154,9 +168,7 @@ class SearchProblem:
         """
         return fit_candidates(self.folds, self._whitened(torques))
 
-    def fits_at_rows(
-        self, effects: Iterable[Effect], axis: int
-    ) -> list[tuple[Effect, CandidateFit]]:
+    def fits_at_rows(self, effects: Iterable[Effect], axis: int) -> list[FitAtRows]:
         """Fit effects on an axis by columns built at the rows.
 
         Those that the model contains already, or that cannot be there, are left out.
@@ -164,10 +176,11 @@ class SearchProblem:
         robot = self.model.robot
         placed = [effect for effect in effects if is_placeable(effect, axis, robot)]
         fits = self.fits(self.torque_at_rows(effect, axis) for effect in placed)
-        found: list[tuple[Effect, CandidateFit]] = []
-        for effect, fit in zip(placed, fits, strict=True):
+        shares = shares_explained(self, fits)
+        found: list[FitAtRows] = []
+        for effect, fit, share in zip(placed, fits, shares, strict=True):
             if fit is not None:
-                found.append((effect, fit))
+                found.append(FitAtRows(effect, fit, share))
         return found
 
     def _whitened(self, torques: Iterable[FloatArray]) -> Iterator[tuple[int, WhitenedColumns]]:
@@ -223,6 +236,15 @@ class SearchProblem:
             columns_of_runs.append(as_recorded(run.rate_hz, conditioning, own))
         columns = np.concatenate(columns_of_runs, axis=-1)
         return at_joints(effect, axis, columns, self.model.drive_train)
+
+
+@dataclass(frozen=True, slots=True)
+class FitAtRows:
+    """An effect on an axis, fitted by columns built at the rows."""
+
+    effect: Effect
+    fit: CandidateFit
+    share: float  #: that it explains of the squared residual of its strongest motor
 
 
 @dataclass(frozen=True, slots=True)
@@ -359,10 +381,11 @@ def _signals_at_rows(run: Signals, data: Dataset, conditioning: Conditioning) ->
     # The arm of a closed chain moves joints that are not axes: it is followed from the axes again.
     arm = run.arm
     if arm is not None:
-        states = (data.position_rad, data.velocity_rad_s, data.acceleration_rad_s2)
         # Samples come first in a dataset, and last in what is decimated.
-        decimated = [decimate_rows(data, conditioning, state.T).T for state in states]
-        arm = replace(arm, motion=Motion(*decimated))
+        decimated = each_state(
+            data.motion(), lambda states: decimate_rows(data, conditioning, states.T).T
+        )
+        arm = replace(arm, motion=decimated)
     return Signals(
         rate_hz=float((len(time_s) - 1) / duration_s),
         inertia_kg_m2=run.inertia_kg_m2[..., :0],
@@ -548,15 +571,15 @@ def _tried_on_folds(
     fall_by_motor = fall_of_motors(folds, sums, along, beta)
     fitted_score = (gram @ beta[..., None])[..., 0]
     scatter = cluster_score - fitted_score
-    left_out = _left_out(folds, before, of_motors, sums)
+    training_fall, left_out = _left_out(folds, before, of_motors, sums)
     trials: list[CandidateTrial] = []
     for number in range(len(along)):
         projected = gram[:, number]
         trial = CandidateTrial(
             coefficients=beta[number],
             fall_by_motor=fall_by_motor[number],
-            training_fall=left_out.training_fall[:, number],
-            left_out=left_out.squares[:, :, number],
+            training_fall=training_fall[:, number],
+            left_out=left_out[:, :, number],
             score=score[number],
             scatter=scatter[:, number],
             gram=projected,
@@ -566,22 +589,17 @@ def _tried_on_folds(
     return tuple(trials)
 
 
-@dataclass(frozen=True, slots=True)
-class _LeftOut:
-    """Candidates fitted without each fold k, in a model that is fitted without it, too."""
-
-    training_fall: FloatArray  #: fall of ‖e‖² on the other folds, shape (folds, c)
-    squares: FloatArray  #: ‖r‖² on the fold, shape (folds, m, c)
-
-
 def _left_out(
     folds: Folds, before: FloatArray, of_motors: Sequence[_Products], sums: MotorSums
-) -> _LeftOut:
+) -> tuple[FloatArray, FloatArray]:
     """Fit candidates with J and Φ of the other folds, for each fold k.
 
     There the declared model takes J w_k of the columns, with w_k = H_k⁻¹ J_kᵀΦ_k of the rows that
     are not in the fold. What is left of them, Φ − J w_k, is fitted on these rows, and predicts the
     fold.
+
+    Returns:
+        fall of ‖e‖² on the other folds, shape (folds, c), and ‖r‖² on the fold, (folds, m, c).
     """
     _, count, width, unknowns = sums.jacobian.shape
     # ΦᵀJ, ΦᵀΦ, Φᵀe and Φᵀr of each fold and motor.
@@ -637,7 +655,7 @@ def _left_out(
     squares = before[:, :, None] - 2.0 * linear
     squares += np.einsum("kcp,kncpq,kcq->knc", beta, fold_gram, beta)
     training_fall = np.sum(other_score * beta, axis=-1)
-    return _LeftOut(training_fall, squares)
+    return training_fall, squares
 
 
 def _shortest_inverse(matrices: FloatArray) -> FloatArray:

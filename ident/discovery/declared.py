@@ -114,7 +114,7 @@ def _is_geometry_to_blame(
         corrected = with_effects(evidence, (*evidence.effects, *corrections))
     except FIT_ERRORS:
         return False
-    return not impossible_declared(replace(corrected, declared=evidence.declared), axes)
+    return not impossible_declared(corrected, axes)
 
 
 def _with_declared_form(evidence: Evidence, forms: Sequence[PlacedEffect]) -> Evidence:

@@ -36,7 +36,7 @@ import numpy as np
 import scipy  # loads scipy.special when it is first used: a fit needs none of it
 
 from ident.arrays import FloatArray, IntArray
-from ident.equations.linearisation import CORRELATED
+from ident.equations.linearisation import CORRELATED, every_other_of_run
 from ident.estimators.estimate import SAME_ERROR
 
 CONFIDENCE = 0.95  #: One-sided, of a change of the whole squared error by more than noise
@@ -227,8 +227,7 @@ def compare_by_block(change: FloatArray, move: IntArray, run: IntArray) -> Paire
         standard_error = float(np.linalg.norm(products))
         if float(products.sum()) <= CORRELATED * standard_error:
             break
-        every_other = [np.flatnonzero(runs == one)[::2] for one in np.unique(runs)]
-        starts = np.sort(np.concatenate(every_other))
+        starts = every_other_of_run(runs)
         if len(starts) == len(sums):
             break
         sums = np.add.reduceat(sums, starts)

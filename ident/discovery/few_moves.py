@@ -10,7 +10,6 @@ where there are enough of them. What rests on few moves sets no limit for others
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from scipy import linalg
@@ -48,17 +47,6 @@ RECORD = {
 }
 """What to record for an effect that shows itself against a variable."""
 NUMBERS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight")
-
-
-class ByMove(Protocol):
-    """What a test needs of a candidate, by cluster; see `MoveScores`."""
-
-    @property
-    def score(self) -> FloatArray: ...
-    @property
-    def scatter(self) -> FloatArray: ...
-    @property
-    def gram(self) -> FloatArray: ...
 
 
 @dataclass(frozen=True, slots=True)

@@ -523,5 +523,4 @@ def _factor(hessian: FloatArray, seen_by_all: FloatArray) -> tuple[FloatArray, b
         seen_by_all: diagonal of JᵀJ of all rows, positive, shape (f,).
     """
     regular = hessian + RIDGE * np.diag(seen_by_all)
-    factor, _ = linalg.cho_factor(regular, lower=True)
-    return factor, True
+    return linalg.cho_factor(regular, lower=True)

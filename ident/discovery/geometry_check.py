@@ -500,11 +500,7 @@ def _rivals(
     at_full_rate: dict[PlacedEffect, FloatArray] = {}
     if late_axes:
         at_full_rate = _columns_at_full_rate(evidence, families, sorted(late_axes))
-    trials = problem.trials(at_full_rate.values())
-    fast: list[FamilyTrials] = []
-    for placed, trial in zip(at_full_rate, trials, strict=True):
-        if trial is not None:
-            fast.append(FamilyTrials(placed.axis, ((placed.effect, trial),)))
+    fast = problem.test_each(at_full_rate, at_full_rate.values())
     findings = rank_families(problem, (*slow, *fast), rng, gates)
     return _Rivals(findings, at_full_rate)
 

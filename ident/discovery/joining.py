@@ -127,6 +127,12 @@ def linearised_after(evidence: Evidence, before: JointFit) -> JointFit:
     return linearised(evidence, cache)
 
 
+def refitted_with(model: JointFit, effects: tuple[PlacedEffect, ...]) -> JointFit:
+    """Refit the same data with these effects, and linearise around the fit."""
+    refitted = with_effects(model.evidence, effects, model.search_problem.runs)
+    return linearised_after(refitted, model)
+
+
 def keys_of(evidence: Evidence) -> frozenset[EffectKey]:
     """Keys of the effects of a model."""
     return frozenset(effect_key(placed.effect, placed.axis) for placed in evidence.effects)
@@ -307,15 +313,13 @@ def with_refined_settings(model: JointFit, index: int = -1) -> JointFit:
         index: place of the effect among those of the model.
     """
     for _ in range(REFINEMENTS):
-        evidence = model.evidence
-        placed = evidence.effects[index]
+        effects = list(model.evidence.effects)
+        placed = effects[index]
         effect = _refined_in(model, placed)
         if effect == placed.effect:
             break
-        effects = list(evidence.effects)
         effects[index] = replace(placed, effect=effect)
-        refitted = with_effects(evidence, tuple(effects), model.search_problem.runs)
-        model = linearised_after(replace(refitted, declared=evidence.declared), model)
+        model = refitted_with(model, tuple(effects))
     return model
 
 
@@ -448,8 +452,7 @@ def _pruned(
             return SetAside(accepted, f"in the joint fit it no longer passes: {worst.why}")
         try:
             others = tuple(placed for placed in evidence.effects if placed != worst.placed)
-            refitted = with_effects(evidence, others, model.search_problem.runs)
-            model = linearised_after(refitted, model)
+            model = refitted_with(model, others)
         except FIT_ERRORS:
             indispensable.add(worst.placed)
 

@@ -14,7 +14,7 @@ late positions among its candidates, too, and may have found one by then.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -133,7 +133,5 @@ def _with_mistakes(
     Raises:
         NotConverged, RankDeficient: see `ident.identify`.
     """
-    before = model.evidence
     placed = tuple(one.placed for one in mistakes)
-    fitted = with_effects(before, (*kept, *placed), model.search_problem.runs)
-    return replace(fitted, declared=before.declared)
+    return with_effects(model.evidence, (*kept, *placed), model.search_problem.runs)

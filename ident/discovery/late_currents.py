@@ -100,12 +100,8 @@ def try_delays(problem: SearchProblem, rates_nm_s: FloatArray) -> tuple[FamilyTr
     """
     lags = [PlacedEffect(Lag(), axis) for axis in range(problem.axes)]
     placed = [*lags, PlacedEffect(TimeSkew(), 0)]
-    trials = problem.trials(delay_columns(problem, one, rates_nm_s) for one in placed)
-    tested: list[FamilyTrials] = []
-    for one, trial in zip(placed, trials, strict=True):
-        if trial is not None:
-            tested.append(FamilyTrials(one.axis, ((one.effect, trial),)))
-    return tuple(tested)
+    torques = (delay_columns(problem, one, rates_nm_s) for one in placed)
+    return problem.test_each(placed, torques)
 
 
 def find_late_currents(

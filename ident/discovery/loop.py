@@ -17,7 +17,7 @@ from ident.discovery.cables import propose_cables
 from ident.discovery.candidates import ColumnCache, FamilyTrials, SearchProblem
 from ident.discovery.choice import choice_covariance, is_small, scored_beside
 from ident.discovery.effect_verdict import EffectVerdict
-from ident.discovery.evidence import Evidence, place_names, with_effects, with_estimate
+from ident.discovery.evidence import Evidence, place_names, with_estimate
 from ident.discovery.gates import (
     Gates,
     PartsLeftOut,
@@ -40,7 +40,7 @@ from ident.discovery.joining import (
     judge_beside_others,
     keys_of,
     linearised,
-    linearised_after,
+    refitted_with,
     refuted_by_structure,
     with_joint_settings,
 )
@@ -393,11 +393,9 @@ def end_search(
                 left_open=tuple(opened),
             )
         worst, why, _ = max(failing, key=lambda one: one[2])
-        evidence = model.evidence
-        others = tuple(placed for placed in evidence.effects if placed != worst)
+        others = tuple(placed for placed in model.evidence.effects if placed != worst)
         try:
-            rest = with_effects(evidence, others, model.search_problem.runs)
-            model = linearised_after(replace(rest, declared=evidence.declared), model)
+            model = refitted_with(model, others)
         except FIT_ERRORS:
             needed.add(worst)  # the data cannot be fitted without it
             continue

@@ -68,7 +68,7 @@ from functools import lru_cache
 import numpy as np
 import scipy  # loads scipy.special when it is first used: a fit needs none of it
 
-from ident.arrays import BoolArray, FloatArray
+from ident.arrays import FloatArray, true_stretches
 from ident.data.conditioning import Conditioning, decimator
 from ident.data.dataset import LONGEST_MOVE_S, Dataset
 from ident.equations.rows import row_filter
@@ -203,8 +203,8 @@ def _dwells(datasets: Sequence[Dataset], conditioning: Conditioning, motor: int)
     """Parts of the standstills of a motor."""
     for data in datasets:
         is_still = ~data.motor_moving[:, motor] & data.valid[:, motor]
-        for dwell in _stretches(is_still):
-            current_a = data.current_a[dwell, motor]
+        for first, end in true_stretches(is_still):
+            current_a = data.current_a[first:end, motor]
             yield from _parts(current_a[None], data.rate_hz, conditioning)
 
 
@@ -269,15 +269,6 @@ def _detrending(rate_hz: float, cutoff_hz: float, rows: int) -> tuple[FloatArray
     return _projection(*_of_length(rate_hz, cutoff_hz, rows))
 
 
-def _stretches(flags: BoolArray) -> list[slice]:
-    """Samples that follow each other and are all set, shape (k,)."""
-    between_unset = np.concatenate(([False], flags, [False]))
-    edges = np.flatnonzero(np.diff(between_unset.astype(np.int8))).tolist()
-    starts = edges[::2]
-    stops = edges[1::2]
-    return [slice(start, stop) for start, stop in zip(starts, stops, strict=True)]
-
-
 @dataclass(frozen=True, slots=True)
 class _MoveChain:
     """Repetitions of one move of a motor, as they followed each other."""
@@ -304,8 +295,9 @@ def _repetitions(
     ends = np.empty((0, 2, len(scale)))  # of the last move of each chain
     for data in sorted(datasets, key=lambda data: data.started_s or 0.0):
         is_moving = data.motor_moving[:, motor] & data.valid[:, motor]
-        for part in _stretches(is_moving):
-            end = data.position_rad[[part.start, part.stop - 1]] * scale
+        for first, stop in true_stretches(is_moving):
+            part = slice(first, stop)
+            end = data.position_rad[[first, stop - 1]] * scale
             # Where a move begins is known to some samples only, in which other axes move on.
             is_near = np.abs(ends - end) < 10.0 * PATH_TOLERANCE
             for index in np.flatnonzero(np.all(is_near, axis=(1, 2))):

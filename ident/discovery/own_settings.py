@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from ident.discovery.candidates import SearchProblem, shares_explained
+from ident.discovery.candidates import SearchProblem
 from ident.discovery.gates import Gates
 from ident.discovery.search import is_testable, refine_setting
 from ident.effects.effect import Effect, is_shipped
@@ -48,8 +48,7 @@ def _members_that_explain(
 ) -> tuple[Effect, ...]:
     """The members that data can show on an axis; none where no member explains enough there."""
     shown = [effect for effect in family if is_testable(search_problem, effect, axis)]
-    fits = [fit for _, fit in search_problem.fits_at_rows(shown, axis)]
-    shares = shares_explained(search_problem, fits)
+    shares = [one.share for one in search_problem.fits_at_rows(shown, axis)]
     if max(shares, default=0.0) < gates.smallest_share:
         return ()
     return tuple(shown)

@@ -7,14 +7,14 @@ derivatives and no scale.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 import scipy  # loads scipy.optimize when it is first used
 
 from ident.arrays import FloatArray
 from ident.discovery.candidate_fits import CandidateFit
-from ident.discovery.candidates import CandidateTrial, SearchProblem
+from ident.discovery.candidates import CandidateTrial, FitAtRows, SearchProblem
 from ident.effects.effect import Effect, Range, is_shipped, setting_range
 
 MOST_TRIALS = 80  #: Of settings, in one refinement
@@ -27,6 +27,23 @@ def is_strictly_possible(effect: Effect, fit: CandidateTrial | CandidateFit) -> 
     """Whether every coefficient is inside its possible values, without tolerance."""
     fitted = zip(effect.coefficients, fit.coefficients, strict=True)
     return all(column.least <= value <= column.largest for column, value in fitted)
+
+
+def best_of_each(fits: Iterable[FitAtRows], setting: str, most: int) -> tuple[Effect, ...]:
+    """The possible effects that explain most, the best first, one for each value of a setting.
+
+    The simplex does not find the way from one value to another.
+
+    Args:
+        fits: of the effects.
+        setting: in which no two of them are alike.
+        most: number of effects.
+    """
+    possible = [one for one in fits if is_strictly_possible(one.effect, one.fit)]
+    best: dict[float, Effect] = {}
+    for one in sorted(possible, key=lambda one: -one.share):
+        best.setdefault(one.effect.settings[setting], one.effect)
+    return tuple(best.values())[:most]
 
 
 def refine_together(search_problem: SearchProblem, effect: Effect, axis: int) -> Effect:

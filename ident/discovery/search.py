@@ -39,7 +39,7 @@ from ident.discovery.candidates import CandidateTrial, FamilyTrials, SearchProbl
 from ident.discovery.few_moves import (
     FEW_MOVES,
     FEWEST_MOVES,
-    ByMove,
+    MoveScores,
     is_tested_on_others,
     moves_behind,
     what_to_record,
@@ -555,8 +555,8 @@ def bootstrap_probabilities(
     """
     moves = len(trials[0].scatter)
     signs = rng.choice((-1.0, 1.0), size=(draws, moves))
-    of_many: dict[int, ByMove] = {}
-    of_few: dict[int, ByMove] = {}
+    of_many: dict[int, Tested] = {}
+    of_few: dict[int, Tested] = {}
     for number, trial in enumerate(trials):
         if moves_behind(trial.gram) >= FEW_MOVES:
             of_many[number] = trial
@@ -575,7 +575,11 @@ def bootstrap_probabilities(
     return probability
 
 
-def _surprises(candidates: Sequence[ByMove], signs: FloatArray) -> tuple[FloatArray, FloatArray]:
+Tested = CandidateTrial | MoveScores
+"""A candidate on all moves, or without those of most leverage."""
+
+
+def _surprises(candidates: Sequence[Tested], signs: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Surprise of candidates, shape (c,), and of the most surprising one of each draw, (draws,).
 
     The Wald statistic of a candidate is sᵀ(XᵀX)⁻¹s, with s = Φ⊥ᵀe and X its scatter by clusters
@@ -615,7 +619,7 @@ def _surprise(wald: FloatArray, freedom: int) -> FloatArray:
     return np.asarray(-np.log(np.maximum(p, TINY)))
 
 
-def _drawn_wald(trial: ByMove, signs: FloatArray) -> FloatArray:
+def _drawn_wald(trial: Tested, signs: FloatArray) -> FloatArray:
     """Wald statistic Sᵀ L⁻¹ S of each draw, shape (draws,).
 
     In a draw, the noise x_m of each move m becomes s_m x_m. The sum S = Σ s_m x_m is taken for an

@@ -23,7 +23,7 @@ from ident.effects.effect import Effect, GearSide, PlacedEffect, Property, Repor
 from ident.effects.signals import Abscissa, Arm, Signals
 from ident.model.geometry import GeometryChange, GeometryKind, GeometryParameter, with_geometry
 from ident.model.model import Column, Model
-from ident.model.robot import Motion, Robot, skew
+from ident.model.robot import Motion, Robot, turned_about
 
 #: Of a difference quotient, rad or m: torques change by 1e-5 of themselves, far above rounding
 POSITION_STEP = 1e-5
@@ -355,15 +355,11 @@ def turn_between(declared_m_s2: FloatArray, found_m_s2: FloatArray) -> FloatArra
 
 
 def rotation_by(vector_rad: FloatArray) -> FloatArray:
-    """Rotation about a vector by its length (Rodrigues), shape (3, 3)."""
+    """Rotation about a vector by its length, shape (3, 3)."""
     angle = float(np.linalg.norm(vector_rad))
     if angle == 0.0:
         return np.eye(3)
-    # I + sin φ [u]× + (1 − cos φ) [u]×²
-    cross = skew(vector_rad / angle)
-    along_circle = np.sin(angle) * cross
-    to_centre = (1.0 - np.cos(angle)) * cross @ cross
-    return np.asarray(np.eye(3) + along_circle + to_centre)
+    return turned_about(vector_rad / angle, angle)
 
 
 def shifted(values: FloatArray, steps: float) -> FloatArray:

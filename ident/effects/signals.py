@@ -15,7 +15,7 @@ from ident.equations.observation import Observation
 from ident.estimators.estimate import Estimate
 from ident.model.bodies import LINK_PARAMETERS, Payload
 from ident.model.model import Model
-from ident.model.robot import Motion
+from ident.model.robot import Motion, at_rest, each_state
 
 STICKING_RAD_S = 0.005  #: Below this speed the noise of the filtered encoder decides the sign
 UNIX_S = 1e9  #: Times from here on, September 2001, are since 1970; earlier ones since some start
@@ -89,11 +89,7 @@ class Arm:
         by_position = f"position {axis}"
         by_velocity = f"velocity {axis}"
         if by_position not in self._kept:
-            motion = Motion(
-                self.motion.position_rad[samples],
-                self.motion.velocity_rad_s[samples],
-                self.motion.acceleration_rad_s2[samples],
-            )
+            motion = each_state(self.motion, lambda states: states[samples])
             position = motion.position_rad.copy()
             position[:, axis] += TWIST_RAD
             velocity = motion.velocity_rad_s.copy()
@@ -126,9 +122,7 @@ class Arm:
         """Torque that carries links and payload in some gravity, at rest [Nm or N], (m, k)."""
         robot = replace(self.model.robot, gravity_m_s2=gravity_m_s2)
         model = replace(self.model, robot=robot)
-        still = np.zeros_like(self.motion.position_rad)
-        at_rest = Motion(self.motion.position_rad, still, still)
-        load, _, _ = model.torques(at_rest, self.standard)
+        load, _, _ = model.torques(at_rest(self.motion.position_rad), self.standard)
         return load
 
 

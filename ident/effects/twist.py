@@ -23,7 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import lapack
 
-from ident.arrays import BoolArray, FloatArray, IntArray
+from ident.arrays import BoolArray, FloatArray, IntArray, true_stretches
 from ident.effects.signals import STICKING_RAD_S, Signals, curvature
 
 RESOLVED = 0.9  #: Largest resonance in parts of half the sampling rate
@@ -195,8 +195,7 @@ def _short_holds(link: DrivenLink, longest: int) -> BoolArray:
     """Whether friction holds the link at rest, for at most so many samples, shape (k,)."""
     is_at_rest = np.abs(link.speed_rad_s) <= STICKING_RAD_S
     is_held = is_at_rest & (link.dry_nm > 0.0)
-    edges = np.flatnonzero(np.diff(is_held, prepend=False, append=False))
-    for first, end in edges.reshape(-1, 2).tolist():
+    for first, end in true_stretches(is_held):
         if end - first > longest:
             is_held[first:end] = False
     return np.asarray(is_held)

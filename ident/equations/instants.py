@@ -14,13 +14,12 @@ from math import ceil
 import numpy as np
 
 from ident.arrays import BoolArray, FloatArray, IntArray, as_array, require_kind
-from ident.data.conditioning import Conditioning, Decimator, current_rows
+from ident.data.conditioning import Conditioning, current_rows
 from ident.data.dataset import Dataset, differentiate
 from ident.data.run import Run
 from ident.equations.rows import row_masks
-from ident.errors import ModelError
 from ident.model.model import Model
-from ident.model.robot import Motion
+from ident.model.robot import Motion, each_state
 
 ROWS_OF_RUN = 450  #: Rows taken of a run
 
@@ -48,25 +47,17 @@ class Instants:
         position_rad = as_array("position_rad of the instants", self.motion.position_rad)
         rows = len(np.atleast_1d(position_rad))
         expected = {
+            "position_rad": (position_rad, (rows, count)),
             "current_a": (self.current_a, (count, rows)),
             "use": (self.use, (count, rows)),
             "move": (self.move, (rows,)),
         }
         for name, (values, shape) in expected.items():
             as_array(f"{name} of the instants", values, shape, remedy)
-        if position_rad.shape != (rows, count):
-            raise ModelError(
-                f"position_rad of the instants has shape {position_rad.shape}; expected "
-                f"({rows}, {count}); {remedy}"
-            )
 
     def every(self, step: int) -> Instants:
         """Every so many of the rows."""
-        motion = Motion(
-            position_rad=np.ascontiguousarray(self.motion.position_rad[::step]),
-            velocity_rad_s=np.ascontiguousarray(self.motion.velocity_rad_s[::step]),
-            acceleration_rad_s2=np.ascontiguousarray(self.motion.acceleration_rad_s2[::step]),
-        )
+        motion = each_state(self.motion, lambda states: np.ascontiguousarray(states[::step]))
         return Instants(
             motion=motion,
             current_a=self.current_a[:, ::step],
@@ -98,11 +89,13 @@ def instants_of(model: Model, data: Dataset, conditioning: Conditioning) -> Inst
     use = motor_use[:, ::step]
     if not use.any():
         return None
-    motion = Motion(
-        position_rad=_at_every_row(filter_, data.position_rad, step),
-        velocity_rad_s=_at_every_row(filter_, data.velocity_rad_s, step),
-        acceleration_rad_s2=_at_every_row(filter_, data.acceleration_rad_s2, step),
-    )
+
+    def at_every_row(states: FloatArray) -> FloatArray:
+        """Decimate a state of the axes to every so many of the rows, time first."""
+        rows = filter_(states.T)
+        return np.ascontiguousarray(rows[:, ::step].T)
+
+    motion = each_state(data.motion(), at_every_row)
     current_a = filter_(data.current_a.T)
     move = data.move[filter_.centres(samples)]
     mounting = None
@@ -115,12 +108,6 @@ def instants_of(model: Model, data: Dataset, conditioning: Conditioning) -> Inst
         move=move[::step],
         mounting=mounting,
     )
-
-
-def _at_every_row(filter_: Decimator, samples: FloatArray, step: int) -> FloatArray:
-    """Decimate a state of the axes to every so many of the rows, time first."""
-    rows = filter_(samples.T)
-    return np.ascontiguousarray(rows[:, ::step].T)
 
 
 def read_instants(

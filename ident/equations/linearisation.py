@@ -15,7 +15,7 @@ within a run are multiplied by V^(−1/2) (`ident.equations.run_scatter`).
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -232,14 +232,10 @@ class Linearisation:
         runs = [run[self.source[own]] for own in rows]
         scatter = RunScatter.of(columns, runs)
         parts: list[FloatArray] = []
-        residuals: list[FloatArray] = []
-        for motor, own in enumerate(rows):
-            part = scatter.decorrelate(motor, self.jacobian.parts[motor])
-            (own_residual,) = scatter.decorrelate(motor, self.residual[None, own])
-            parts.append(part)
-            residuals.append(own_residual)
+        for motor, part in enumerate(self.jacobian.parts):
+            parts.append(scatter.decorrelate(motor, part))
         jacobian = replace(self.jacobian, parts=tuple(parts))
-        residual = np.concatenate(residuals)
+        residual = self._by_motor(scatter.decorrelate, self.residual)
         return replace(self, jacobian=jacobian, residual=residual, scatter=scatter)
 
     def fitted(self) -> tuple[Linearisation, FloatArray]:
@@ -256,21 +252,22 @@ class Linearisation:
         """V^(−1/2) times one number a row, shape (rows,); V is 1 where runs share no errors."""
         if self.scatter is None:
             return columns
-        parts: list[FloatArray] = []
-        for motor in range(len(self.gamma)):
-            own = columns[None, self.rows_of(motor)]
-            (part,) = self.scatter.decorrelate(motor, own)
-            parts.append(part)
-        return np.concatenate(parts)
+        return self._by_motor(self.scatter.decorrelate, columns)
 
     def correlated(self, columns: FloatArray) -> FloatArray:
         """V times one number a row, shape (rows,); V is 1 where runs share no errors."""
         if self.scatter is None:
             return columns
+        return self._by_motor(self.scatter.correlate, columns)
+
+    def _by_motor(
+        self, product: Callable[[int, FloatArray], FloatArray], columns: FloatArray
+    ) -> FloatArray:
+        """A product of `RunScatter` with one number a row, shape (rows,)."""
         parts: list[FloatArray] = []
         for motor in range(len(self.gamma)):
             own = columns[None, self.rows_of(motor)]
-            (part,) = self.scatter.correlate(motor, own)
+            (part,) = product(motor, own)
             parts.append(part)
         return np.concatenate(parts)
 
@@ -426,7 +423,7 @@ def left_out_shifts(grams: FloatArray, scores: FloatArray) -> FloatArray:
         scores: s_c = J_cᵀe_c around the estimate, where they sum to zero, shape (C, f).
     """
     hessian = grams.sum(axis=0)
-    unit = _even_unit(hessian)
+    unit = even_unit(hessian)
     hessians_without = (hessian - grams) * np.outer(unit, unit)
     steps: list[FloatArray] = []
     for matrix, score in zip(hessians_without, scores, strict=True):
@@ -435,10 +432,10 @@ def left_out_shifts(grams: FloatArray, scores: FloatArray) -> FloatArray:
     return -np.stack(steps)
 
 
-def _even_unit(hessian: FloatArray) -> FloatArray:
-    """Units in which the diagonal of H is one, shape (f,): some unknowns are in kg, some in kg m².
+def even_unit(hessian: FloatArray) -> FloatArray:
+    """Return the units in which the diagonal of H is one, shape (f,).
 
-    The factorisation then compares like with like.
+    Some unknowns are in kg, some in kg m²: the factorisation then compares like with like.
     """
     diagonal = np.diag(hessian)
     squares = np.where(diagonal > 0.0, diagonal, 1.0)
@@ -491,7 +488,7 @@ def independent_blocks(grams: FloatArray, scores: FloatArray, runs: IntArray) ->
     """
     starts = np.arange(len(grams))
     hessian = grams.sum(axis=0)
-    unit = _even_unit(hessian)
+    unit = even_unit(hessian)
     scaled = hessian * np.outer(unit, unit)
     scaled[np.diag_indices_from(scaled)] += 1e-9  # a direction that no row shows
     lower = np.linalg.cholesky(scaled)
@@ -505,7 +502,7 @@ def independent_blocks(grams: FloatArray, scores: FloatArray, runs: IntArray) ->
         scaled_error = float(np.linalg.norm(products))
         if float(products.sum()) <= CORRELATED * scaled_error:
             return starts
-        first = _every_other_of_run(runs)
+        first = every_other_of_run(runs)
         if len(first) < MIN_MOVES_TO_LEAVE_OUT:
             return starts
         starts = starts[first]
@@ -513,8 +510,8 @@ def independent_blocks(grams: FloatArray, scores: FloatArray, runs: IntArray) ->
         runs = runs[first]
 
 
-def _every_other_of_run(runs: IntArray) -> IntArray:
-    """Indices of the first, third, … entry of each run, ascending."""
+def every_other_of_run(runs: IntArray) -> IntArray:
+    """Return the indices of the first, third, … entry of each run, ascending."""
     chosen: list[IntArray] = []
     for run in np.unique(runs):
         of_run = np.flatnonzero(runs == run)
@@ -803,7 +800,7 @@ def cut_into_folds(problem: Linearisation, move_of: IntArray | None = None) -> F
         scores_of_motor = part_score[:, own.motor]  # a view, too
         scores_of_motor[:, own.seen] = own.by_fold(scores_of_blocks[..., 0], FOLDS)
     problem = _with_sorted_jacobian(problem, by_motor)
-    full_factor = _lower_factor(hessian)
+    full_factor = linalg.cho_factor(hessian, lower=True)
     estimate_factor = full_factor
     if problem.scatter is not None:
         estimate_factor = _estimate_factor(problem, problem.scatter, hessian)
@@ -941,12 +938,6 @@ def _with_sorted_jacobian(problem: Linearisation, by_motor: Sequence[MotorRows])
     return replace(problem, jacobian=jacobian)
 
 
-def _lower_factor(matrix: FloatArray) -> tuple[FloatArray, bool]:
-    """Cholesky factor L of L Lᵀ, with scipy's flag that it is the lower one."""
-    factor, _ = linalg.cho_factor(matrix, lower=True)
-    return factor, True
-
-
 def _estimate_factor(
     problem: Linearisation, scatter: RunScatter, hessian: FloatArray
 ) -> tuple[FloatArray, bool]:
@@ -958,4 +949,4 @@ def _estimate_factor(
     of_estimate = hessian.copy()
     for motor, (part, seen) in enumerate(zip(jacobian.parts, jacobian.seen, strict=True)):
         of_estimate[np.ix_(seen, seen)] += scatter.shared(motor, part)
-    return _lower_factor(of_estimate)
+    return linalg.cho_factor(of_estimate, lower=True)

@@ -76,15 +76,15 @@ class Observation(Equations):
             parts.append(columns * is_mounted)
         return np.concatenate(parts)
 
-    def known(self, rows: BoolArray | slice = slice(None)) -> FloatArray:
-        """W_kL χ_kL of some rows: joint torque of what is known of the payloads [Nm], (m, rows)."""
+    def known(self) -> FloatArray:
+        """W_kL χ_kL: joint torque of what is known of the payloads [Nm], shape (m, r)."""
         # An index of −1, no load, takes the last row, which stays zero.
         weights = np.zeros((len(self.payloads) + 1, 10))
         for index, payload in enumerate(self.payloads):
             weights[index] = payload.known_parameters
-        parameters = weights[self.mounting[rows]]
+        parameters = weights[self.mounting]
         # Σ_p (W_L)_jpr χ_rp of each joint j and row r
-        torque = np.einsum("jpr,rp->jr", self.flange[:, :, rows], parameters)
+        torque = np.einsum("jpr,rp->jr", self.flange, parameters)
         return np.asarray(torque)
 
     def motor_columns(self) -> Iterator[FloatArray]:

@@ -591,15 +591,27 @@ def shown_base(standard: System) -> BaseParameters:
     Raises:
         JointStill: a joint never moves.
     """
-    for joint, rows in enumerate(standard.joints.rows):
-        if not rows:
-            name = standard.model.robot.axes[joint].name
-            found = f"{name} never moves above its standstill speed in any run"
-            raise JointStill(", ".join(standard.runs), (name,), found)
+    require_moved(standard, [joint.name for joint in standard.model.robot.axes])
     names = tuple(column.name for column in standard.columns)
     columns = _linear_columns(standard)[:, : len(names)]
     columns = _with_one_friction_where_no_row_is_bare(standard.model, columns)
     return base_parameters(columns, names)
+
+
+def require_moved(standard: System, axes: Sequence[str]) -> None:
+    """Refuse runs in none of which a joint moves.
+
+    Args:
+        standard: of the runs.
+        axes: name of each axis.
+
+    Raises:
+        JointStill: for this joint.
+    """
+    for name, rows in zip(axes, standard.joints.rows, strict=True):
+        if not rows:
+            found = f"{name} never moves above its standstill speed in any run"
+            raise JointStill(", ".join(standard.runs), (name,), found)
 
 
 def _with_one_friction_where_no_row_is_bare(model: Model, columns: FloatArray) -> FloatArray:

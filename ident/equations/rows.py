@@ -10,7 +10,7 @@ from math import ceil
 
 import numpy as np
 
-from ident.arrays import BoolArray, FloatArray, IntArray
+from ident.arrays import BoolArray, FloatArray, IntArray, true_stretches
 from ident.data.conditioning import (
     Conditioning,
     Decimator,
@@ -22,7 +22,7 @@ from ident.data.conditioning import (
 from ident.data.dataset import Dataset
 from ident.errors import DataUnfit, ModelError
 from ident.model.model import Model, preload_directions, spread
-from ident.model.robot import Motion
+from ident.model.robot import Motion, each_state
 
 #: Decimated rows built at once: the regressor of their samples stays in the cache's reach
 CHUNK_ROWS = 256
@@ -134,12 +134,23 @@ def row_masks(
     return use, motor_use
 
 
+def require_any_row(data: Dataset, use: BoolArray) -> None:
+    """Refuse a run without a row that counts, by those of each axis, shape (m, r).
+
+    Raises:
+        DataUnfit: no row counts.
+    """
+    if not use.any():
+        raise DataUnfit(
+            data.name, "no row is left after the standstill and validity masks; did the robot move?"
+        )
+
+
 def _rests(still: BoolArray, shortest: int) -> BoolArray:
     """Samples of each column that are still for so many samples at least, shape (k, m)."""
     found = np.zeros_like(still)
     for own, column in zip(found.T, still.T, strict=True):
-        edges = np.flatnonzero(np.diff(column.astype(np.int8), prepend=0, append=0))
-        for begin, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+        for begin, end in true_stretches(column):
             own[begin:end] = end - begin >= shortest
     return found
 
@@ -216,10 +227,7 @@ def rows_of(
         )
     filter_ = row_filter(data, conditioning)
     use, motor_use = row_masks(model, data, conditioning)
-    if not use.any():
-        raise DataUnfit(
-            data.name, "no row is left after the standstill and validity masks; did the robot move?"
-        )
+    require_any_row(data, use)
     samples = len(data.time_s)
     centres = filter_.centres(samples)
     time_s = data.time_s[centres] - data.time_s[0]
@@ -290,11 +298,7 @@ def demanded_at_rows(demanded: Motion, filter_: Decimator) -> Motion:
     """Decimate a demanded motion to the rows:
     it is slow enough for their rate, and an instrument need not be exact.
     """
-    return Motion(
-        position_rad=filter_(demanded.position_rad.T).T,
-        velocity_rad_s=filter_(demanded.velocity_rad_s.T).T,
-        acceleration_rad_s2=filter_(demanded.acceleration_rad_s2.T).T,
-    )
+    return each_state(demanded, lambda states: filter_(states.T).T)
 
 
 def _instruments(
@@ -313,17 +317,10 @@ def _instruments(
     memory = memory_samples(rate_hz, conditioning)
     first = max(piece.start - memory, 0)
     around = slice(first, piece.stop + memory)
-    columns = model.regressor(_part(demanded, around), loaded=data.payload is not None)
+    part = each_state(demanded, lambda states: states[around])
+    columns = model.regressor(part, loaded=data.payload is not None)
     recorded = as_recorded(rate_hz, conditioning, columns)
     return recorded[..., piece.start - first : piece.stop - first]
-
-
-def _part(motion: Motion, rows: slice) -> Motion:
-    return Motion(
-        position_rad=motion.position_rad[rows],
-        velocity_rad_s=motion.velocity_rad_s[rows],
-        acceleration_rad_s2=motion.acceleration_rad_s2[rows],
-    )
 
 
 def motor_columns(to_motor: FloatArray, of_joint: Callable[[int], FloatArray]) -> FloatArray:

@@ -40,7 +40,12 @@ from ident.data.run_channels import (
     limit_diagnoses,
     still_diagnoses,
 )
-from ident.data.unsigned_current import missing_sign, one_sided_currents, unsigned_currents
+from ident.data.unsigned_current import (
+    missing_sign,
+    one_sided_currents,
+    refuse_unsigned,
+    unsigned_currents,
+)
 from ident.equations.reduction import motor_support
 from ident.equations.rows import motor_columns, rows_of
 from ident.equations.system import System
@@ -63,7 +68,7 @@ from ident.estimators.refusals import (
     joint_torques,
     numbers_text,
     refuse_mistakes,
-    weight_ratio,
+    weight_off,
     with_channel_causes,
 )
 from ident.model.model import Model
@@ -261,12 +266,10 @@ def judged_estimate(system: System, estimate: Estimate) -> Estimate:
 
 def weight_diagnoses(system: System, estimate: Estimate) -> Iterator[Diagnosis]:
     """Compare the weight of the payload by fixed gains with the declared one."""
-    if not estimate.gains_fixed or not system.knows_payload:
+    if not estimate.gains_fixed:
         return
-    ratio, std = weight_ratio(system, estimate)
-    is_too_heavy = ratio - std > WEIGHT_RATIO
-    is_too_light = ratio + std < 1.0 / WEIGHT_RATIO
-    if not is_too_heavy and not is_too_light:
+    ratio = weight_off(system, estimate, WEIGHT_RATIO)
+    if ratio is None:
         return
     loaded = {run for run, mounting in system.cluster_runs if mounting >= 0}
     runs = tuple(system.runs[run] for run in sorted(loaded))
@@ -632,9 +635,7 @@ def require_explained_currents(
         with suppress(DataUnfit):
             own_errors = np.diag(channel_errors(model, (run,), conditioning))
             unsigned &= ~(100.0 * own_errors <= LARGEST_AXIS_ERROR_PERCENT)
-    if unsigned.any():
-        names = tuple(axis for axis, found in zip(axes, unsigned, strict=True) if found)
-        raise CurrentUnsigned(run.name, names, missing_sign(run.current_a[:, unsigned]))
+    refuse_unsigned(run, unsigned, axes)
 
 
 def unsigned_channels(

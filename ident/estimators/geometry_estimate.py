@@ -33,7 +33,7 @@ import scipy  # loads its modules when they are first used
 from ident.arrays import BoolArray, FloatArray
 from ident.data.run import Run
 from ident.estimators.encoder_noise import MisfitNoise, RunDirections, estimate_noise
-from ident.model.closed_chain import positions, reach_near
+from ident.model.closed_chain import joints_by_free_ones, positions, reach_near, solve_qr
 from ident.model.closures import loops
 from ident.model.geometry import (
     GeometryChange,
@@ -91,7 +91,6 @@ TOLERATED_SHARE = 0.02
 class Positions:
     """Some recorded positions of one run, with what is around them in time."""
 
-    run: str  #: its name
     time_s: FloatArray  #: of each, shape (k,)
     position_rad: FloatArray  #: of the axes, as recorded, shape (k, m)
     before_rad: FloatArray  #: one sample earlier, shape (k, m)
@@ -140,9 +139,8 @@ class GeometryFinding:
     covariance: FloatArray  #: of their changes, shape (p, p)
     #: Other explanations with as many numbers that these positions cannot distinguish from it.
     alternatives: tuple[tuple[GeometryEstimate, ...], ...]
-    #: All zeros and lengths, estimated together; σ is infinite where it cannot be seen.
-    every: tuple[GeometryEstimate, ...]
-    unobservable: tuple[str, ...]  #: directions of them that no position shows, in words
+    #: directions of zeros and lengths that no position shows, in words
+    unobservable: tuple[str, ...]
 
     @property
     def corrections(self) -> tuple[GeometryEstimate, ...]:
@@ -181,7 +179,6 @@ def thinned(run: Run) -> Positions:
         motion += moved_rad[:, :, None] * weight
     counts = [_smallest_step(position_rad[usable, axis]) for axis in range(axes)]
     return Positions(
-        run=run.name,
         time_s=time_s[chosen],
         position_rad=position_rad[chosen],
         before_rad=position_rad[chosen - 1],
@@ -273,7 +270,6 @@ def estimate_geometry(model: Model, runs: Sequence[Positions]) -> GeometryFindin
         causes=estimates,
         covariance=covariance,
         alternatives=tuple(alternatives),
-        every=fitted.every(),
         unobservable=fitted.unobservable(),
     )
 
@@ -376,7 +372,7 @@ class _Problem:
 
     def _closed(self, robot: Robot, axes_rad: FloatArray) -> FloatArray:
         """Poses of another geometry that fit the encoders best, shape (k, n)."""
-        return reach_near(robot, self.model.assembly, self.near_rad, axes_rad).position_rad
+        return reach_near(robot, self.model.assembly, self.near_rad, axes_rad)
 
     def _apart(self, axes_rad: FloatArray, position_rad: FloatArray) -> FloatArray:
         """e of poses, shape (k (m − d),)."""
@@ -412,7 +408,7 @@ class _Problem:
         axes_rad = self._recorded(changes)
         position_rad = self._closed(robot, axes_rad)
         closing = loops(robot, position_rad, assembly.size_m)
-        to_joints, q, r = _to_joints(self.model, closing.jacobian)
+        to_joints, q, r = joints_by_free_ones(assembly, closing.jacobian)
         # P = I − Q Qᵀ, Q an orthonormal basis of the motors' possible motion
         onto = np.linalg.qr(to_joints[:, motors]).Q
         hidden = np.eye(len(motors)) - onto @ np.swapaxes(onto, 1, 2)
@@ -433,11 +429,8 @@ class _Problem:
                     longer = with_geometry(robot, (GeometryChange(parameter, step),))
                     longer_closing = loops(longer, position_rad, assembly.size_m)
                     gap = longer_closing.residual - closing.residual
-                    # Qᵀ Δφ in each sample
-                    turned_gap = np.einsum("kcr,kc->kr", q, gap)
-                    solution = np.linalg.solve(r, turned_gap[..., None])
                     moved = np.zeros(position_rad.shape)
-                    moved[:, rest] = -solution[..., 0]
+                    moved[:, rest] = -solve_qr(q, r, gap)
                     # −P dq_d of the motors' joints
                     column = -np.einsum("kij,kj->ki", hidden, moved[:, motors]) / step
             columns.append(unit * self._in_directions(column))
@@ -493,27 +486,13 @@ def _moved(motion: FloatArray, time_s: FloatArray) -> FloatArray:
     return np.asarray(np.einsum("kmn,mn->km", motion, powers))
 
 
-def _to_joints(model: Model, jacobian: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """G in each sample, shape (k, n, d), with Q and R of J_d."""
-    x = list(model.assembly.independent)
-    rest = list(model.assembly.dependent)
-    samples, _, joints = jacobian.shape
-    q, r = np.linalg.qr(jacobian[:, :, rest])
-    # dq_d = −J_d⁻¹ J_x dx
-    turned = np.swapaxes(q, 1, 2) @ jacobian[:, :, x]
-    to_joints = np.zeros((samples, joints, len(x)))
-    to_joints[:, x] = np.eye(len(x))
-    to_joints[:, rest] = -np.linalg.solve(r, turned)
-    return to_joints, q, r
-
-
 def _misfit_directions(model: Model, position_rad: FloatArray, axis_unit: FloatArray) -> FloatArray:
     """Orthonormal directions of the axes in which no motion goes, shape (k, m, m − d).
 
     They are in the units of the axes.
     """
     closing = loops(model.robot, position_rad, model.assembly.size_m)
-    to_joints, _, _ = _to_joints(model, closing.jacobian)
+    to_joints, _, _ = joints_by_free_ones(model.assembly, closing.jacobian)
     to_motors = to_joints[:, list(model.robot.axis_joints)]
     mobility = model.assembly.mobility
     complete = np.linalg.qr(to_motors, mode="complete").Q
@@ -525,8 +504,7 @@ def _misfit_directions(model: Model, position_rad: FloatArray, axis_unit: FloatA
 class _Visible:
     """Directions of some parameters that the positions show."""
 
-    singular: FloatArray  #: singular values of their white columns, shape (p,)
-    ways: FloatArray  #: right singular vectors, a row each, shape (p, p)
+    ways: FloatArray  #: right singular vectors of their white columns, a row each, shape (p, p)
     seen: int  #: how many of them these positions show
 
     @classmethod
@@ -536,17 +514,12 @@ class _Visible:
         is_real = singular > SMALLEST_SINGULAR * singular[0]
         is_known = np.sqrt(variance) < largest_std * singular
         seen = int(np.sum(is_real & is_known))
-        return cls(singular, ways, seen)
+        return cls(ways, seen)
 
     @property
     def seen_ways(self) -> FloatArray:
         """Those that these positions show, a column each, shape (p, seen)."""
         return self.ways[: self.seen].T
-
-    @property
-    def hidden_ways(self) -> FloatArray:
-        """The others, a row each, shape (p − seen, p)."""
-        return self.ways[self.seen :]
 
     def estimate(self, columns: FloatArray, right: FloatArray) -> FloatArray:
         """Least squares of what is seen; the rest stays as it is described."""
@@ -572,14 +545,12 @@ class _Linearised:
     whole_square: float  #: Σ of the white e² with all that is seen estimated
 
     @classmethod
-    def at(
-        cls, problem: _Problem, changes: FloatArray, noise: MisfitNoise | None, noise_std: float
-    ) -> _Linearised:
-        """Linearise around changes of all parameters in their units."""
+    def at(cls, problem: _Problem, changes: FloatArray, noise_std: float) -> _Linearised:
+        """Linearise around changes of all parameters in their units, by rows as they are."""
         every = range(len(problem.parameters))
         misfit, jacobian = problem.linearised(changes, every)
         right = jacobian @ changes - misfit
-        return cls.of(problem, jacobian, right, noise, noise_std)
+        return cls.of(problem, jacobian, right, None, noise_std)
 
     @classmethod
     def of(
@@ -706,40 +677,14 @@ class _Linearised:
         inverse = np.linalg.inv(upper)
         return np.asarray(self.variance * (inverse @ inverse.T))
 
-    @cached_property
-    def _description(self) -> _Visible:
-        """Directions of zeros and lengths."""
-        columns = self._columns[:, list(self.problem.described)]
-        return _Visible.of(columns, float(self.variance), LARGEST_STD)
-
-    def every(self) -> tuple[GeometryEstimate, ...]:
-        """All zeros and lengths estimated together, as far as they are seen."""
-        described = list(self.problem.described)
-        columns = self._columns[:, described]
-        visible = self._description
-        values = visible.estimate(columns, self._right)
-        left = self._right - columns @ values
-        freedom = max(self.problem.rows - visible.seen, 1)
-        variance = float(left @ left) / freedom
-        # σ² Σ (v_i/s_i)² over the directions that are seen
-        seen_singular = visible.singular[: visible.seen]
-        per_noise = visible.seen_ways / seen_singular
-        variances = variance * np.sum(per_noise**2, axis=1)
-        hidden_share = np.sum(visible.hidden_ways**2, axis=0)
-        is_hidden = hidden_share > SMALLEST_SINGULAR
-        stds = np.where(is_hidden, np.inf, np.sqrt(variances))
-        unit = self.problem.unit[described]
-        values *= unit
-        stds *= unit
-        parameters = self.problem.parameters[: len(described)]
-        estimates: list[GeometryEstimate] = []
-        for parameter, value, std in zip(parameters, values, stds, strict=True):
-            estimates.append(GeometryEstimate(parameter, float(value), float(std)))
-        return tuple(estimates)
-
     def unobservable(self) -> tuple[str, ...]:
-        """Directions that the positions do not show, by the numbers with the largest part."""
-        return tuple(self._direction(way) for way in self._description.hidden_ways)
+        """Directions of zeros and lengths that the positions do not show, by the numbers with the
+        largest part.
+        """
+        columns = self._columns[:, list(self.problem.described)]
+        visible = _Visible.of(columns, float(self.variance), LARGEST_STD)
+        hidden_ways = visible.ways[visible.seen :]
+        return tuple(self._direction(way) for way in hidden_ways)
 
     def _direction(self, way: FloatArray) -> str:
         least_share = 0.1 * np.abs(way).max()
@@ -754,7 +699,7 @@ class _Linearised:
 def _whole(problem: _Problem) -> _Linearised:
     """Linearise around the estimate of all numbers; directions that are not seen stay."""
     as_described = np.zeros(len(problem.parameters))
-    start = _Linearised.at(problem, as_described, None, 0.0)
+    start = _Linearised.at(problem, as_described, 0.0)
     near = _settled(start, as_described)
     fitted = _with_noise(problem, near.whole())
     return _settled(fitted, fitted.whole())
@@ -763,7 +708,7 @@ def _whole(problem: _Problem) -> _Linearised:
 def _with_noise(problem: _Problem, changes: FloatArray) -> _Linearised:
     """Linearise near an estimate, with the noise that is left there."""
     noise_std = problem.noise_std(changes)
-    fitted = _Linearised.at(problem, changes, None, noise_std)
+    fitted = _Linearised.at(problem, changes, noise_std)
     seen_jacobian = fitted.jacobian @ fitted.visible.seen_ways
     noise = estimate_noise(problem.directions, seen_jacobian, fitted.right)
     return _Linearised.of(problem, fitted.jacobian, fitted.right, noise, noise_std)

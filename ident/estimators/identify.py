@@ -9,17 +9,17 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ident.arrays import FloatArray, as_array, require_kind, require_names, takes
+from ident.arrays import FloatArray, as_gains, require_kind, require_names, takes
 from ident.data.conditioning import Conditioning
 from ident.data.dataset import Dataset
-from ident.data.run import Run, SeenRuns, require_named, usual_conditioning
+from ident.data.run import Run, SeenRuns, require_entry, require_named, usual_conditioning
 from ident.data.run_channels import RunChannels, channels_of, require_usable_channels
 from ident.equations.instants import Instants, instants_of
 from ident.equations.observation import observe
-from ident.equations.reduction import reduce_built, regrouped, rows_of_runs
+from ident.equations.reduction import reduce_built, regrouped, require_moved, rows_of_runs
 from ident.equations.rows import Rows, rows_of
 from ident.equations.system import System, require_distinct
-from ident.errors import DataUnfit, IdentificationError, JointStill, ModelError
+from ident.errors import DataUnfit, IdentificationError
 from ident.estimators.diagnosis import require_explained_currents
 from ident.estimators.estimate import Estimate, Identification
 from ident.estimators.least_squares import ls, tls, wls
@@ -199,12 +199,7 @@ def _known_gains(fixed_gains: ArrayLike | None, model: Model) -> FloatArray | No
     """Gains that a caller holds fixed, shape (m,); None where they are free."""
     if fixed_gains is None:
         return None
-    gains = as_array("fixed_gains", fixed_gains, (model.robot.axis_count,), "one per motor")
-    if not gains.all():
-        raise ModelError(
-            f"fixed_gains is {gains.tolist()}; expected no zero: such a motor moves nothing"
-        )
-    return gains
+    return as_gains("fixed_gains", fixed_gains, model.robot.axis_count)
 
 
 def _without_limited_currents(
@@ -253,19 +248,6 @@ def _without_limited_currents(
 
 
 BuiltRun = tuple[Dataset, Sequence[Rows]]  #: A differentiated run and its rows, piece by piece
-
-
-def require_moved(standard: System, axes: Sequence[str]) -> None:
-    """Refuse runs in none of which a joint moves.
-
-    Raises:
-        JointStill: for this joint.
-    """
-    row_counts = standard.joints.rows[: len(axes)]
-    for axis, row_count in enumerate(row_counts):
-        if not row_count:
-            found = f"{axes[axis]} never moves above its standstill speed in any run"
-            raise JointStill(", ".join(standard.runs), (axes[axis],), found)
 
 
 def noting_channels(
@@ -319,9 +301,7 @@ def each_run(
     """
     require_kind("runs or holdout", runs, Iterable, "give a list: [bare, loaded]")
     for run in runs:
-        require_kind(
-            "an entry of the runs", run, Run, "write Run(name, time_s, position_rad, current_a)"
-        )
+        require_entry(run)
         require_named(run)
         seen.add(run)
         if run.payload is not None and payloads is not None:

@@ -132,20 +132,42 @@ def _solve(
     width = len(full) - 1
     covariance = np.zeros((width, width))
     covariance[first_estimated:, first_estimated:] = variance * inverse
-    weighted = system.weighted_singular_values(full, unknown_count, gains=not has_fixed_gains)
-    condition = float(weighted[0] / weighted[-1])
-    axis_noise = triangles.residual_std(full, unknown_count)
+    return _estimate(
+        system,
+        method,
+        full,
+        covariance,
+        singular_values(matrix),
+        unknown_count,
+        gains_fixed=has_fixed_gains,
+    )
+
+
+def _estimate(
+    system: System,
+    method: Method,
+    solution: FloatArray,
+    covariance: FloatArray,
+    singular: FloatArray,
+    unknown_count: int,
+    *,
+    gains_fixed: bool,
+) -> Estimate:
+    """The estimate of a solution (g, χ, χ_uL, 1) of eq. (17), with so many of them estimated."""
+    count = system.axis_count
+    triangles = system.joints
+    weighted = system.weighted_singular_values(solution, unknown_count, gains=not gains_fixed)
     return Estimate(
         method=method,
-        gains=full[:count],
-        gains_fixed=has_fixed_gains,
+        gains=solution[:count],
+        gains_fixed=gains_fixed,
         unknowns=system.unknowns,
-        parameters=full[count:-1],
+        parameters=solution[count:-1],
         covariance=covariance,
-        axis_noise=axis_noise,
-        singular_values=singular_values(matrix),
-        condition=condition,
-        rows=rows,
+        axis_noise=triangles.residual_std(solution, unknown_count),
+        singular_values=singular,
+        condition=float(weighted[0] / weighted[-1]),
+        rows=int(triangles.rows.sum()),
     )
 
 
@@ -179,26 +201,11 @@ def tls(system: System, scaling: Scaling = Scaling.ROWS) -> Estimate:
         DataUnfit: no run carries a known payload.
     """
     require_known_payload(system)
-    triangles = system.joints
     weight = 1.0 / tls_row_std(system, scaling)
-    vector, covariance, singular = _smallest(triangles, weight, scaling.has_unit_columns)
-    count = system.axis_count
+    vector, covariance, singular = _smallest(system.joints, weight, scaling.has_unit_columns)
     unknown_count = len(vector) - 1
-    axis_noise = triangles.residual_std(vector, unknown_count)
-    weighted = system.weighted_singular_values(vector, unknown_count, gains=True)
-    condition = float(weighted[0] / weighted[-1])
-    rows = int(triangles.rows.sum())
-    return Estimate(
-        method=Method.TLS,
-        gains=vector[:count],
-        gains_fixed=False,
-        unknowns=system.unknowns,
-        parameters=vector[count:-1],
-        covariance=covariance,
-        axis_noise=axis_noise,
-        singular_values=singular,
-        condition=condition,
-        rows=rows,
+    return _estimate(
+        system, Method.TLS, vector, covariance, singular, unknown_count, gains_fixed=False
     )
 
 

@@ -13,7 +13,12 @@ import scipy  # loads its modules when they are first used: a clean fit needs no
 
 from ident.arrays import FloatArray
 from ident.equations.currents import PreloadedCurrents
-from ident.equations.linearisation import MIN_MOVES_TO_LEAVE_OUT, left_out_shifts, motor_jacobians
+from ident.equations.linearisation import (
+    MIN_MOVES_TO_LEAVE_OUT,
+    left_out_shifts,
+    motor_jacobians,
+    scatter_of,
+)
 from ident.equations.system import System
 from ident.errors import Diagnosis, PayloadDiffers
 from ident.estimators.payload_ratio import MassContradiction, contradicting_masses
@@ -365,11 +370,7 @@ def _chance(
         scores[index] = columns.T @ left
     all_shifts = left_out_shifts(grams, scores)
     shifts = all_shifts[:, other_count:]
-    centred = shifts - shifts.mean(axis=0)
-    # The jackknife: (n − 1)/n Σ (δ_i − δ̄)(δ_i − δ̄)ᵀ
-    jackknife_factor = (len(moves) - 1) / len(moves)
-    covariance = jackknife_factor * (centred.T @ centred)
-    wald = float(amount @ np.linalg.solve(covariance, amount))
+    wald = float(amount @ np.linalg.solve(scatter_of(shifts), amount))
     # T² (n − q) / (q (n − 1)) has an F distribution with q and n − q degrees of freedom.
     move_count = len(inside)
     directions = len(amount)

@@ -21,6 +21,7 @@ import scipy  # loads its modules when they are first used: a clean fit needs no
 from ident.arrays import FloatArray
 from ident.equations.linearisation import (
     MIN_MOVES_TO_LEAVE_OUT,
+    even_unit,
     left_out_shifts,
     motor_jacobian,
     scatter_of,
@@ -179,9 +180,7 @@ def _normal_equations(
 
 def _solved(gram: FloatArray, score: FloatArray) -> FloatArray:
     """Step of least squares, in units in which every unknown is seen equally well."""
-    squares = np.diag(gram)
-    squares = np.where(squares > 0.0, squares, 1.0)
-    unit = 1.0 / np.sqrt(squares)
+    unit = even_unit(gram)
     scaled_gram = gram * np.outer(unit, unit)
     scaled_step = np.linalg.lstsq(scaled_gram, score * unit, rcond=None)[0]
     return unit * np.asarray(scaled_step)

@@ -424,25 +424,35 @@ def require_weight(system: System, estimate: Estimate) -> None:
     Raises:
         UnitsMistaken: more than UNIT_RATIO times, or less than 1/UNIT_RATIO of what was declared.
     """
-    if not system.knows_payload:
+    ratio = weight_off(system, estimate, UNIT_RATIO)
+    if ratio is None:
         return
-    ratio, std = weight_ratio(system, estimate)
-    is_too_heavy = ratio - std > UNIT_RATIO
-    is_too_light = ratio + std < 1.0 / UNIT_RATIO
-    if is_too_heavy or is_too_light:
-        remedy = (
-            "are the currents in mA and read as A, is its mass in g and read as kg, or was "
-            "it not mounted?"
-        )
-        raise UnitsMistaken(
-            "the weight of the payload",
-            found=f"{ratio:.3g} times the declared one, by these gains",
-            expected=f"1, and within a factor of {UNIT_RATIO:g} at least",
-            remedy=remedy,
-        )
+    remedy = (
+        "are the currents in mA and read as A, is its mass in g and read as kg, or was "
+        "it not mounted?"
+    )
+    raise UnitsMistaken(
+        "the weight of the payload",
+        found=f"{ratio:.3g} times the declared one, by these gains",
+        expected=f"1, and within a factor of {UNIT_RATIO:g} at least",
+        remedy=remedy,
+    )
 
 
-def weight_ratio(system: System, estimate: Estimate) -> tuple[float, float]:
+def weight_off(system: System, estimate: Estimate, largest: float) -> float | None:
+    """Weight of the payload by given gains, relative to the declared one.
+
+    None where it is within the largest ratio, or not known.
+    """
+    if not system.knows_payload:
+        return None
+    ratio, std = _weight_ratio(system, estimate)
+    if ratio - std > largest or ratio + std < 1.0 / largest:
+        return ratio
+    return None
+
+
+def _weight_ratio(system: System, estimate: Estimate) -> tuple[float, float]:
     """Size of W_kL χ_kL that the currents ask for with given gains, and WEIGHT_SIGMAS of its σ."""
     gains = estimate.gains
     row_count = int(system.motors.rows.sum())

@@ -41,10 +41,11 @@ import numpy as np
 import scipy  # loads its modules when they are first used
 from numpy.typing import ArrayLike
 
-from ident.arrays import FloatArray, IntArray, as_array, require_entries, takes
+from ident.arrays import FloatArray, IntArray, as_gains, require_entries, takes
 from ident.data.conditioning import Conditioning
 from ident.data.run import Run
 from ident.equations.instants import Instants
+from ident.equations.linearisation import scatter_of
 from ident.errors import Diagnosis, IdentificationError, ModelError
 from ident.estimators.identify import identify
 from ident.estimators.method import Method
@@ -52,7 +53,7 @@ from ident.estimators.refusals import FRICTION, LARGEST_TOTAL_PERCENT, SMALL_ERR
 from ident.model.base import SMALLEST_COLUMN
 from ident.model.bodies import LINK_PARAMETERS
 from ident.model.model import Model
-from ident.model.robot import JointKind, Motion
+from ident.model.robot import JointKind, Motion, at_rest
 from ident.model.suggested_gravity import suggested_gravity
 
 GRAVITY_TURNED = "gravity-turned"
@@ -308,11 +309,7 @@ def find_turned_geometry(
         of_run.require_axes(model.robot.axis_count)
     if model.is_redundant or not instants:
         return None
-    nameplate = as_array("gains", gains, (model.robot.axis_count,), "one per motor")
-    if not nameplate.all():
-        raise ModelError(
-            f"gains is {nameplate.tolist()}; expected no zero: such a motor moves nothing"
-        )
+    nameplate = as_gains("gains", gains, model.robot.axis_count)
     reference = 1.0 / np.abs(nameplate)
     if not _is_suspect(model, _thinned(instants), reference):
         return None
@@ -400,11 +397,7 @@ def _is_suspect(model: Model, instants: Sequence[Instants], reference: FloatArra
         if reading.sign > 0.0 and not is_gross:
             continue
         with suppress(ModelError):  # the loops of a closed chain cannot be closed so
-            products = products_of_reading(model, instants, reading, part_count=1)
-            square = products.square[:, 0]
-            near = start.in_reading(reading)
-            fit = improved(square, rows, near, reference, FIT_ROUNDS)
-            if _log_error(square, fit) < limit:
+            if _left_in_reading(model, instants, reading, start, reference) < limit:
                 return True
     return False
 
@@ -441,7 +434,8 @@ def _best_zero(
 
     def left(zero_rad: float) -> float:
         try:
-            return _left_with_zero(model, instants, axis, zero_rad, start, reference)
+            reading = PositionReading(axis, zero_rad=zero_rad)
+            return _left_in_reading(model, instants, reading, start, reference)
         except ModelError:  # the loops of a closed chain cannot be closed so
             return np.inf
 
@@ -544,7 +538,8 @@ def _small_zero(
     """
 
     def left(zero: float) -> float:
-        return _left_with_zero(model, instants, axis, zero, start, reference)
+        reading = PositionReading(axis, zero_rad=zero)
+        return _left_in_reading(model, instants, reading, start, reference)
 
     zero, _ = _least(left, -SMALL_ZERO, SMALL_ZERO)
     is_at_bound = SMALL_ZERO - abs(zero) < 2.0 * ZERO_TOLERANCE_RAD
@@ -564,26 +559,25 @@ def _least(left: Callable[[float], float], lower: float, upper: float) -> tuple[
     return float(found.x), float(found.fun)
 
 
-def _left_with_zero(
+def _left_in_reading(
     model: Model,
     instants: Sequence[Instants],
-    axis: int,
-    zero: float,
+    reading: PositionReading,
     start: MotorFit,
     reference: FloatArray,
 ) -> float:
-    """Logarithm of the motors' errors, in sum, where an axis is read from another zero [rad or m].
+    """Logarithm of the motors' errors, in sum, where an axis is read otherwise.
 
     Arguments as for `_best_zero`.
 
     Raises:
         ModelError: the loops of a closed chain cannot be closed so.
     """
-    reading = PositionReading(axis, zero_rad=zero)
     products = products_of_reading(model, instants, reading, part_count=1)
     square = products.square[:, 0]
-    rows = products.rows.sum(axis=1)
-    fit = improved(square, rows, start, reference, FIT_ROUNDS)
+    rows = products.rows[:, 0]
+    near = start.in_reading(reading)
+    fit = improved(square, rows, near, reference, FIT_ROUNDS)
     return _log_error(square, fit)
 
 
@@ -624,8 +618,7 @@ def _judged_gravity(
         directions.append(of_others)
         left.append(left_over(own, fit_of_others))
     unit = np.array(directions) / np.linalg.norm(found)
-    covariance = (PARTS - 1) * np.cov(unit.T, ddof=0)  # of the jackknife
-    largest_variance = np.linalg.eigvalsh(covariance)[-1]
+    largest_variance = np.linalg.eigvalsh(scatter_of(unit))[-1]
     std_deg = float(np.rad2deg(np.sqrt(largest_variance)))
     gravity = GravityFound(declared, found, std_deg)
     current_square = weighed.directed(found).current_square
@@ -1117,21 +1110,17 @@ def gravity_products(
     payload_columns = len(model.columns) + len(LINK_PARAMETERS) * body_numbers
     first_of_body = np.append(model.link_columns[:, 0], payload_columns)
     weighty = (first_of_body[:, None] + np.array(WEIGHTY)).ravel()
-    squares = list[FloatArray]()
-    rows = list[IntArray]()
-    for one, parts in zip(instants, _parts(instants, part_count), strict=True):
-        position_rad = one.motion.position_rad
-        still = np.zeros_like(position_rad)
-        rest = Motion(position_rad, still, still)
+
+    def columns_of(one: Instants) -> FloatArray:
+        rest = at_rest(one.motion.position_rad)
         columns = [_motor_columns(weightless, one, one.motion, mountings)]
         for in_unit_gravity in pulled:
             of_weight = _motor_columns(in_unit_gravity, one, rest, mountings)
             columns.append(of_weight[:, weighty])
-        columns.append(one.current_a[:, None])
-        square, counted = _products(np.concatenate(columns, axis=1), one, parts, part_count)
-        squares.append(square)
-        rows.append(counted)
-    return GravityProducts(np.sum(squares, axis=0), np.sum(rows, axis=0), weighty)
+        return np.concatenate(columns, axis=1)
+
+    square, rows = _summed_products(instants, part_count, columns_of)
+    return GravityProducts(square, rows, weighty)
 
 
 def products_of_reading(
@@ -1143,17 +1132,32 @@ def products_of_reading(
         ModelError: the loops of a closed chain cannot be closed.
     """
     mountings = _mountings(instants)
+
+    def columns_of(one: Instants) -> FloatArray:
+        return _motor_columns(model, one, reading.motion(one.motion), mountings)
+
+    square, rows = _summed_products(instants, part_count, columns_of)
+    return Products(square, rows)
+
+
+def _summed_products(
+    instants: Sequence[Instants], part_count: int, columns_of: Callable[[Instants], FloatArray]
+) -> tuple[FloatArray, IntArray]:
+    """Products of the columns and the current of each motor over all runs, by part; row counts.
+
+    Args:
+        instants: of all runs.
+        part_count: number of parts of the moves.
+        columns_of: columns of each motor in a run, shape (m, c, k).
+    """
     squares = list[FloatArray]()
     rows = list[IntArray]()
     for one, parts in zip(instants, _parts(instants, part_count), strict=True):
-        motion = reading.motion(one.motion)
-        of_torque = _motor_columns(model, one, motion, mountings)
-        current = one.current_a[:, None]
-        columns = np.concatenate((of_torque, current), axis=1)
+        columns = np.concatenate((columns_of(one), one.current_a[:, None]), axis=1)
         square, counted = _products(columns, one, parts, part_count)
         squares.append(square)
         rows.append(counted)
-    return Products(np.sum(squares, axis=0), np.sum(rows, axis=0))
+    return np.sum(squares, axis=0), np.sum(rows, axis=0)
 
 
 def _parts(instants: Sequence[Instants], part_count: int) -> list[IntArray]:

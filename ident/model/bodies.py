@@ -182,15 +182,25 @@ def pseudo_inertia(link: FloatArray) -> FloatArray:
     return out
 
 
+def pseudo_factors(links: FloatArray) -> FloatArray:
+    """Cholesky factor L of each link's pseudo-inertia, (n, 10) → (n, 4, 4)."""
+    pseudo_inertias = np.array([pseudo_inertia(link) for link in links])
+    return np.asarray(np.linalg.cholesky(pseudo_inertias))
+
+
 def link_parameters(pseudo: FloatArray) -> FloatArray:
     """The inverse of `pseudo_inertia`, (4, 4) → (10,); of the mean with the transpose."""
     symmetric = 0.5 * (pseudo + pseudo.T)
     second_moments = symmetric[:3, :3]
     first_moments = symmetric[:3, 3]
-    mass = symmetric[3:, 3]
     inertia = np.trace(second_moments) * np.eye(3) - second_moments
+    return _ten(inertia, first_moments, symmetric[3, 3])
+
+
+def _ten(inertia: FloatArray, first_moment: FloatArray, mass: float) -> FloatArray:
+    """Parameters of a link in the order of LINK_PARAMETERS, shape (10,)."""
     upper = inertia[_ROWS, _COLUMNS]
-    return np.concatenate((upper, first_moments, mass))
+    return np.concatenate((upper, first_moment, (mass,)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -206,10 +216,8 @@ class Body:
     def parameters(self) -> FloatArray:
         """About the link frame's origin (Huygens-Steiner), as LINK_PARAMETERS, shape (10,)."""
         mass = self.mass_kg
-        inertia = self.inertia_kg_m2 + mass * _steiner(self.centre_m)
-        first_moment = mass * self.centre_m
-        upper = inertia[_ROWS, _COLUMNS]
-        return np.concatenate((upper, first_moment, (mass,)))
+        inertia = self.inertia_kg_m2 + mass * steiner(self.centre_m)
+        return _ten(inertia, mass * self.centre_m, mass)
 
 
 def body_of(link: FloatArray) -> Body:
@@ -221,11 +229,11 @@ def body_of(link: FloatArray) -> Body:
     mass = float(link[9])
     centre_m = link[6:9] / mass
     about_origin = _symmetric(link[:6])
-    inertia = about_origin - mass * _steiner(centre_m)
+    inertia = about_origin - mass * steiner(centre_m)
     return Body(mass, centre_m, inertia)
 
 
-def _steiner(centre_m: FloatArray) -> FloatArray:
+def steiner(centre_m: FloatArray) -> FloatArray:
     """c · c 1 − c cᵀ, shape (3, 3): inertia of a unit mass at a point."""
     square = centre_m @ centre_m
     return np.asarray(square * np.eye(3) - np.outer(centre_m, centre_m))

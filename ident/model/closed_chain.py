@@ -184,7 +184,6 @@ def follow(robot: Robot, assembly: Assembly, axes: Motion) -> TreeMotion:
             position are large forces.
     """
     motors = list(robot.axis_joints)
-    x = list(assembly.independent)
     dependent = list(assembly.dependent)
     axes_rad = np.asarray(axes.position_rad, dtype=np.float64)
     samples = len(axes_rad)
@@ -194,22 +193,15 @@ def follow(robot: Robot, assembly: Assembly, axes: Motion) -> TreeMotion:
         return TreeMotion(axes, identity, identity, np.ones(samples))
     position = positions(robot, assembly, axes_rad)
     jacobian = loops(robot, position, assembly.size_m).jacobian
-    # G: the identity in the rows of x, G_d = −R⁻¹ Qᵀ J_x in the others.
-    q, r = np.linalg.qr(jacobian[:, :, dependent])
-    projected_x = np.swapaxes(q, 1, 2) @ jacobian[:, :, x]
-    to_joints = np.zeros((samples, count, len(x)))
-    to_joints[:, x] = np.eye(len(x))
-    to_joints[:, dependent] = -np.linalg.solve(r, projected_x)
+    to_joints, q, r = joints_by_free_ones(assembly, jacobian)
     # ẋ by q̇_a = A ẋ, and q̇ = G ẋ.
     to_motors = to_joints[:, motors]
     velocity_x = _least_squares(to_motors, np.asarray(axes.velocity_rad_s))
     velocity = np.einsum("knd,kd->kn", to_joints, velocity_x)
     # h_d = −R⁻¹ Qᵀ J̇ q̇.
     loop_bias = loops(robot, position, assembly.size_m, velocity).bias  # J̇ q̇
-    projected_bias = np.einsum("kcr,kc->kr", q, loop_bias)
-    bias_of_dependent = np.linalg.solve(r, projected_bias[..., None])
     bias = np.zeros((samples, count))  # h
-    bias[:, dependent] = -bias_of_dependent[..., 0]
+    bias[:, dependent] = -solve_qr(q, r, loop_bias)
     # ẍ by q̈_a = A ẍ + h_a, and q̈ = G ẍ + h.
     axes_without_bias = np.asarray(axes.acceleration_rad_s2) - bias[:, motors]
     acceleration_x = _least_squares(to_motors, axes_without_bias)
@@ -221,6 +213,28 @@ def follow(robot: Robot, assembly: Assembly, axes: Motion) -> TreeMotion:
     _require_regular(robot, axes_rad, condition_of_motors, "motors")
     joints = Motion(position, velocity, acceleration)
     return TreeMotion(joints, to_joints, to_motors, condition)
+
+
+def joints_by_free_ones(
+    assembly: Assembly, jacobian: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return G of q̇ = G ẋ in each sample, shape (k, n, d), with Q and R of J_d.
+
+    It is the identity in the rows of x, and G_d = −R⁻¹ Qᵀ J_x in the others.
+
+    Args:
+        assembly: of the robot.
+        jacobian: of its closures, shape (k, c, n).
+    """
+    x = list(assembly.independent)
+    dependent = list(assembly.dependent)
+    samples, _, joints = jacobian.shape
+    q, r = np.linalg.qr(jacobian[:, :, dependent])
+    projected_x = np.swapaxes(q, 1, 2) @ jacobian[:, :, x]
+    to_joints = np.zeros((samples, joints, len(x)))
+    to_joints[:, x] = np.eye(len(x))
+    to_joints[:, dependent] = -np.linalg.solve(r, projected_x)
+    return to_joints, q, r
 
 
 def _require_regular(robot: Robot, axes_rad: FloatArray, condition: FloatArray, of: str) -> None:
@@ -393,7 +407,7 @@ def reach(robot: Robot, assembly: Assembly, axes_rad: FloatArray) -> Reach:
             near = np.repeat(found, len(finer), axis=0)
         coarse = finer
         found, gap, condition = _newton(robot, assembly, near, axes_rad[finer])
-    misfit = _largest_misfit(found[:, motors], axes_rad)
+    misfit = np.max(np.abs(found[:, motors] - axes_rad), axis=1)
     return Reach(found, gap, misfit, condition)
 
 
@@ -403,15 +417,9 @@ def _every(stride: int, samples: int) -> IntArray:
     return np.unique(np.append(indices, samples - 1))
 
 
-def _largest_misfit(found_rad: FloatArray, axes_rad: FloatArray) -> FloatArray:
-    """Largest difference of a motor's joint from its measured position in each sample, (k,)."""
-    difference = np.abs(found_rad - axes_rad)
-    return np.asarray(np.max(difference, axis=1))
-
-
 def reach_near(
     robot: Robot, assembly: Assembly, near_rad: FloatArray, axes_rad: FloatArray
-) -> Reach:
+) -> FloatArray:
     """Close the loops from poses near by, as those with slightly other lengths or zeros.
 
     Args:
@@ -419,11 +427,12 @@ def reach_near(
         assembly: of this robot, or of the other one: which joints follow is the same.
         near_rad: positions of all joints, shape (k, n).
         axes_rad: of the motors' joints, shape (k, m).
+
+    Returns:
+        positions of all joints, shape (k, n).
     """
-    motors = list(robot.axis_joints)
-    found, gap, condition = _newton(robot, assembly, near_rad, axes_rad)
-    misfit = _largest_misfit(found[:, motors], axes_rad)
-    return Reach(found, gap, misfit, condition)
+    position, _, _ = _newton(robot, assembly, near_rad, axes_rad)
+    return position
 
 
 def _newton(
@@ -549,8 +558,9 @@ def _closed_near(robot: Robot, start: FloatArray, size_m: float) -> FloatArray:
     residual = loops(robot, start[None], size_m).residual[0]
     if float(np.max(np.abs(residual))) < LARGEST_GAP:
         for moved in (passive, joints):
-            position = _closed_by(robot, start, size_m, moved)
-            if position is not None:
+            position, gap = towards_closed(robot, start, size_m, moved)
+            farthest = float(np.max(np.abs(position - start)))
+            if gap < CLOSED and farthest < np.pi:  # less than half a turn
                 return position
     closure, gaps = _worst_closure(robot, np.abs(residual))
     # A gap is a share of the robot's size where its direction is a length, else an angle.
@@ -562,11 +572,11 @@ def _closed_near(robot: Robot, start: FloatArray, size_m: float) -> FloatArray:
     )
 
 
-def _closed_by(
-    robot: Robot, start: FloatArray, size_m: float, moved: list[int]
-) -> FloatArray | None:
-    """Close the loops by moving some joints less than half a turn;
-    None where Newton's iteration does not.
+def towards_closed(
+    robot: Robot, start: FloatArray, size_m: float, moved: Sequence[int]
+) -> tuple[FloatArray, float]:
+    """Close the loops by moving some joints, as far as Newton's iteration does: the position, (n,),
+    and the gap that was left before the last step.
     """
     position = start.copy()
     for _ in range(MAX_ITERATIONS):
@@ -576,17 +586,10 @@ def _closed_by(
         if gap < CLOSED or not np.isfinite(gap):
             break
         jacobian = closing.jacobian[0][:, moved]
-        position[moved] -= _shortest_step(jacobian, residual)
-    farthest = float(np.max(np.abs(position - start)))
-    if gap < CLOSED and farthest < np.pi:
-        return position
-    return None
-
-
-def _shortest_step(jacobian: FloatArray, residual: FloatArray) -> FloatArray:
-    """The shortest x with J x = φ, or nearly so, shape (n,)."""
-    step, *_ = np.linalg.lstsq(jacobian, residual, rcond=1e-8)
-    return np.asarray(step)
+        # The shortest step that closes them, or nearly so
+        step, *_ = np.linalg.lstsq(jacobian, residual, rcond=1e-8)
+        position[moved] -= step
+    return position, gap
 
 
 def _worst_closure(robot: Robot, gaps: FloatArray) -> tuple[Closure, FloatArray]:
@@ -623,11 +626,17 @@ def _independent(free: FloatArray) -> tuple[int, ...]:
     return tuple(sorted(chosen))
 
 
-def null_space(jacobian: FloatArray) -> FloatArray:
-    """Motions of the joints that the closures leave free, shape (n, d)."""
-    _, values, directions = np.linalg.svd(jacobian)
-    smallest = SMALLEST_RANK * values.max(initial=0.0)
-    rank = int(np.sum(values > smallest))
+def null_space(matrix: FloatArray, smallest: float = SMALLEST_RANK) -> FloatArray:
+    """Orthonormal directions that a matrix makes zero, shape (n, d).
+
+    Of the closures' Jacobian, these are the motions of the joints that they leave free.
+
+    Args:
+        matrix: shape (r, n).
+        smallest: singular value, relative to the largest, that is none.
+    """
+    _, values, directions = np.linalg.svd(matrix)
+    rank = int(np.sum(values > smallest * values.max(initial=0.0)))
     return np.asarray(directions[rank:].T)
 
 
@@ -637,14 +646,13 @@ def _generic_rank(robot: Robot, position: FloatArray, free: FloatArray, size_m: 
     The rank is the largest of four poses at random: at a single one it may be singular again.
     """
     motors = list(robot.axis_joints)
+    joints = range(robot.joint_count)
     rng = np.random.default_rng(0)
     best = 0
     for _ in range(4):
         near = position + 0.02 * free @ rng.standard_normal(free.shape[1])
-        for _ in range(MAX_ITERATIONS):
-            closing = loops(robot, near[None], size_m)
-            near -= _shortest_step(closing.jacobian[0], closing.residual[0])
-        jacobian = loops(robot, near[None], size_m).jacobian[0]
+        closed, _ = towards_closed(robot, near, size_m, joints)
+        jacobian = loops(robot, closed[None], size_m).jacobian[0]
         driven = null_space(jacobian)[motors]
         rank = int(np.linalg.matrix_rank(driven, tol=1e-6))
         best = max(best, rank)
@@ -708,7 +716,11 @@ def _size(robot: Robot, position: FloatArray) -> float:
 
 def _least_squares(matrix: FloatArray, right: FloatArray) -> FloatArray:
     """Solution of A x = b in each sample, shapes (k, m, d) and (k, m); exact for a square A."""
-    q, r = np.linalg.qr(matrix)
-    projected = np.einsum("kmd,km->kd", q, right)  # Qᵀ b
+    return solve_qr(*np.linalg.qr(matrix), right)
+
+
+def solve_qr(q: FloatArray, r: FloatArray, right: FloatArray) -> FloatArray:
+    """Return R⁻¹ Qᵀ b in each sample, shape (k, d), with Q of (k, m, d) and b of (k, m)."""
+    projected = np.einsum("kmd,km->kd", q, right)
     solution = np.linalg.solve(r, projected[..., None])
     return np.asarray(solution[..., 0])

@@ -19,7 +19,7 @@ import numpy as np
 from ident.arrays import FloatArray
 from ident.errors import ModelError
 from ident.model.model import Model
-from ident.model.robot import Closure, Joint, JointKind, Place, Robot, skew
+from ident.model.robot import Closure, Joint, JointKind, Place, Robot, turned_about
 
 DIRECTIONS = ("x", "y", "z")  #: Axes of the base
 #: Origins that are closer to each other have no direction along which to be wrong
@@ -224,7 +224,7 @@ def _with_zero(robot: Robot, name: str, change: float) -> Robot:
     number = _joint_number(robot, name)
     joint = robot.joints[number]
     if joint.kind is JointKind.REVOLUTE:
-        rotation = joint.rotation @ _turn(joint.axis, change)
+        rotation = joint.rotation @ turned_about(joint.axis, change)
         moved = replace(joint, rotation=rotation)
     else:
         direction = joint.rotation @ joint.axis
@@ -236,14 +236,6 @@ def _with_zero(robot: Robot, name: str, change: float) -> Robot:
     pose_rad = robot.assembly_rad.copy()
     pose_rad[number] -= change
     return replace(changed, assembly_rad=pose_rad)
-
-
-def _turn(axis: FloatArray, angle_rad: float) -> FloatArray:
-    """Rotation by an angle about a unit vector, shape (3, 3): Rodrigues' formula."""
-    cross = skew(axis)
-    sine = np.sin(angle_rad)
-    one_less_cosine = 1.0 - np.cos(angle_rad)
-    return np.asarray(np.eye(3) + sine * cross + one_less_cosine * (cross @ cross))
 
 
 def _with_length(robot: Robot, parameter: GeometryParameter, change_m: float) -> Robot:

@@ -12,7 +12,7 @@ in no equation: the columns are then those of the least τ without it,
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from hashlib import blake2b
 from typing import TYPE_CHECKING
@@ -26,7 +26,7 @@ from ident.model.bodies import LINK_PARAMETERS, LINK_UNITS, LOADED
 from ident.model.closed_chain import Assembly, TreeMotion, assemble, follow
 from ident.model.pivots import pivot_motion, pivot_rates
 from ident.model.regressor import fill_rigid, mass_matrix, rigid_torque
-from ident.model.robot import JointKind, Motion, Robot, require_described
+from ident.model.robot import JointKind, Motion, Robot, at_rest, chain_of, require_described
 
 DRIVE_UNITS = {
     JointKind.REVOLUTE: ("Nm", "rad/s", "kg m²"),
@@ -261,6 +261,10 @@ class Model:
         count = len(self.drive_train.coupled)
         return first + COUPLED_COLUMNS * np.arange(count)
 
+    def _each_coupled(self) -> Iterable[tuple[int, int]]:
+        """Each motor that turns with several joints, and its first column."""
+        return zip(self.drive_train.coupled, self._coupled_columns.tolist(), strict=True)
+
     @property
     def coupled_dry_friction_columns(self) -> IntArray:
         """Column of fsm of each motor that turns with several joints, shape (coupled,)."""
@@ -310,14 +314,10 @@ class Model:
             if self.robot.is_constrained:
                 out[:, own] = True
                 continue
-            joint = link
-            while joint >= 0:  # a link loads its joint and those before it
+            for joint in chain_of(self.robot, link):  # that the link loads
                 out[joint, own] = True
-                joint = self.robot.joints[joint].parent
         direction = self.drive_train.direction
-        for motor, first in zip(
-            self.drive_train.coupled, self._coupled_columns.tolist(), strict=True
-        ):
+        for motor, first in self._each_coupled():
             is_turned = direction[motor] != 0.0
             out[:, first : first + COUPLED_COLUMNS] = is_turned[:, None]
         if self.friction_by_payload:
@@ -411,9 +411,7 @@ class Model:
             own[OFFSET] = 1.0
         direction = self.drive_train.direction
         motor_speed = direction @ velocity[axes]
-        for motor, first in zip(
-            self.drive_train.coupled, self._coupled_columns.tolist(), strict=True
-        ):
+        for motor, first in self._each_coupled():
             r = direction[motor]
             cross = _off_diagonal(r)
             out[axes, first] = cross @ acceleration[axes]
@@ -474,9 +472,7 @@ class Model:
         total += geared
         total += offset
         direction = self.drive_train.direction
-        for motor, first in zip(
-            self.drive_train.coupled, self._coupled_columns.tolist(), strict=True
-        ):
+        for motor, first in self._each_coupled():
             inertia, viscous, dry = standard[first : first + COUPLED_COLUMNS]
             r = direction[motor]
             smooth = _off_diagonal(r) @ (inertia * acceleration + viscous * velocity)
@@ -502,8 +498,7 @@ class Model:
         if not self.robot.is_constrained:
             position = np.ascontiguousarray(position_rad.T)
             return mass_matrix(self.robot, position, links)
-        still = np.zeros_like(position_rad)
-        followed = self.follow(Motion(position_rad, still, still))
+        followed = self.follow(at_rest(position_rad))
         position = np.ascontiguousarray(followed.joints.position_rad.T)
         tree = mass_matrix(self.robot, position, links)
         # M G A⁺ of the joints of the tree: torque per unit of acceleration of each axis

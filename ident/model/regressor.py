@@ -25,7 +25,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ident.arrays import BoolArray, FloatArray
+from ident.arrays import BoolArray, FloatArray, true_stretches
 from ident.model.robot import Joint, JointKind, Robot, skew
 
 #: Samples computed at once: with fewer, most of the time goes into the calls of numpy
@@ -121,11 +121,7 @@ def _project_row(
 
 def _spans(wanted: BoolArray) -> list[slice]:
     """Spans of indices that are wanted."""
-    padded = np.concatenate(([0], wanted, [0]))
-    edges = np.flatnonzero(np.diff(padded)).tolist()
-    starts = edges[::2]
-    ends = edges[1::2]
-    return [slice(*span) for span in zip(starts, ends, strict=True)]
+    return [slice(*span) for span in true_stretches(wanted)]
 
 
 def rigid_torque(

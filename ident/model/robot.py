@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from typing import TYPE_CHECKING, TypeVar
@@ -334,6 +334,21 @@ class Motion:
                 object.__setattr__(self, name, as_array(f"{name} of the motion", value))
 
 
+def each_state(motion: Motion, change: Callable[[FloatArray], FloatArray]) -> Motion:
+    """Return a motion whose positions, velocities and accelerations are changed alike."""
+    return Motion(
+        position_rad=change(motion.position_rad),
+        velocity_rad_s=change(motion.velocity_rad_s),
+        acceleration_rad_s2=change(motion.acceleration_rad_s2),
+    )
+
+
+def at_rest(position_rad: FloatArray) -> Motion:
+    """Return the motion of joints that stay at positions, shape (k, n)."""
+    still = np.zeros_like(position_rad)
+    return Motion(position_rad, still, still)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Poses:
     """Poses of n + 1 frames in the base frame over k samples;
@@ -369,6 +384,13 @@ def poses(robot: Robot, position_rad: FloatArray) -> Poses:
     return Poses(rotation, origin)
 
 
+def chain_of(robot: Robot, joint: int) -> Iterator[int]:
+    """A joint and those before it, to the base; none of the base itself, -1."""
+    while joint >= 0:
+        yield joint
+        joint = robot.joints[joint].parent
+
+
 def _own_rotations(robot: Robot, position_rad: FloatArray) -> FloatArray:
     """Rotation of each joint's frame in its parent's, shape (n, k, 3, 3).
 
@@ -392,3 +414,11 @@ def skew(vector: FloatArray) -> FloatArray:
     """Matrix of the cross product with a vector, shape (3, 3)."""
     x, y, z = vector
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+def turned_about(axis: FloatArray, angle_rad: float) -> FloatArray:
+    """Rotation by an angle about a unit vector, shape (3, 3): Rodrigues' formula."""
+    cross = skew(axis)
+    sine = np.sin(angle_rad)
+    one_less_cosine = 1.0 - np.cos(angle_rad)
+    return np.asarray(np.eye(3) + sine * cross + one_less_cosine * (cross @ cross))

@@ -15,6 +15,7 @@ import numpy as np
 
 from ident.arrays import FloatArray
 from ident.model.bodies import LOADED
+from ident.model.closed_chain import null_space
 from ident.model.model import Model
 from ident.model.robot import Motion
 
@@ -60,7 +61,7 @@ def foreign_base_parameter(model: Model, names: Sequence[str]) -> str | None:
     size = np.linalg.norm(rows, axis=0)
     is_seen = size > RANK_TOLERANCE * float(size.max())
     scale = np.where(is_seen, size, 1.0)
-    invisible = _null_space(rows / scale)
+    invisible = null_space(rows / scale, RANK_TOLERANCE)
     leading, weights = _weights(compared, column_names)
     by_torque = scale[leading, None] / scale  # weights for columns of unit size
     change = np.linalg.norm((weights * by_torque) @ invisible, axis=1)
@@ -101,10 +102,3 @@ def _drawn_states(axis_count: int) -> Motion:
     random = np.random.default_rng(0)
     position, velocity, acceleration = random.uniform(-RANGE, RANGE, (3, STATES, axis_count))
     return Motion(position, velocity, acceleration)
-
-
-def _null_space(rows: FloatArray) -> FloatArray:
-    """Orthonormal N with rows @ N = 0, shape (m, c) → (c, c - rank)."""
-    _, singular, right = np.linalg.svd(rows, full_matrices=True)
-    rank = int(np.count_nonzero(singular > RANK_TOLERANCE * singular[0]))
-    return np.asarray(right[rank:].T)

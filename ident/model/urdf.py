@@ -28,7 +28,7 @@ from ident.arrays import (
     takes,
 )
 from ident.errors import ModelError
-from ident.model.bodies import Body
+from ident.model.bodies import Body, steiner
 from ident.model.pivots import cut_pivots
 from ident.model.robot import (
     DIRECTIONS,
@@ -738,10 +738,7 @@ def _joined(first: Body, second: Body) -> Body:
     # μ (‖d‖² 1 − d dᵀ), μ the reduced mass
     distance = first.centre_m - second.centre_m
     reduced_mass = first.mass_kg * second.mass_kg / mass
-    square = distance @ distance
-    per_mass = square * np.eye(3) - np.outer(distance, distance)
-    steiner = reduced_mass * per_mass
-    return Body(mass, centre, inertia + steiner)
+    return Body(mass, centre, inertia + reduced_mass * steiner(distance))
 
 
 def _origin(element: Element, name: str) -> tuple[FloatArray, FloatArray]:

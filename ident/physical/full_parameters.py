@@ -56,7 +56,8 @@ from ident.arrays import FloatArray
 from ident.equations.system import System
 from ident.errors import ModelError
 from ident.estimators.estimate import Estimate
-from ident.model.bodies import link_parameters, pseudo_inertia
+from ident.model.bodies import link_parameters, pseudo_factors, pseudo_inertia
+from ident.model.closed_chain import null_space
 from ident.model.model import Model
 from ident.physical.consistency import (
     MARGIN,
@@ -109,8 +110,7 @@ class LinkPrior:
     @property
     def factors(self) -> FloatArray:
         """L of each link, shape (n, 4, 4)."""
-        pseudo_inertias = np.array([pseudo_inertia(link) for link in self.links])
-        return np.linalg.cholesky(pseudo_inertias)
+        return pseudo_factors(self.links)
 
     def directions(self) -> FloatArray:
         """Change of each link's ten parameters for one σ of ten independent numbers.
@@ -458,10 +458,9 @@ def _loose_drives(system: System, columns: FloatArray, size: float) -> FloatArra
     norms = np.linalg.norm(of_scalars, axis=0)
     if not np.all(norms > 0.0):
         return np.zeros((0, count))
-    _, singular, right = np.linalg.svd(of_scalars / norms, full_matrices=True)
-    rank = int(np.sum(singular > _LOOSE * singular[0]))
-    rows = np.zeros((len(scalars) - rank, count))
-    rows[:, scalars] = right[rank:] * (norms / size)
+    unseen = null_space(of_scalars / norms, _LOOSE).T
+    rows = np.zeros((len(unseen), count))
+    rows[:, scalars] = unseen * (norms / size)
     return rows
 
 

@@ -15,7 +15,7 @@ from ident.arrays import FloatArray
 from ident.errors import ModelError
 from ident.estimators.estimate import RelativeError, relative_error
 from ident.model.base import BaseParameters
-from ident.model.bodies import Body, link_parameters, pseudo_inertia
+from ident.model.bodies import Body, link_parameters, pseudo_factors, pseudo_inertia
 from ident.model.model import Model
 from ident.model.robot import Motion
 from ident.model.same_robot import TERM
@@ -210,8 +210,7 @@ class InertiaPrior:
     @property
     def factors(self) -> FloatArray:
         """Cholesky factor L of each link's pseudo-inertia, shape (n, 4, 4)."""
-        pseudo_inertias = np.array([pseudo_inertia(link) for link in self.links])
-        return np.asarray(np.linalg.cholesky(pseudo_inertias), dtype=np.float64)
+        return pseudo_factors(self.links)
 
 
 def urdf_links(urdf: str) -> FloatArray:

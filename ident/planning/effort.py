@@ -14,7 +14,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ident.arrays import FloatArray
-from ident.model.robot import Motion
+from ident.model.robot import Motion, at_rest
 from ident.planning.excitation import Expectation
 
 EFFORT_MARGIN = 1.3  #: Effort limit over the largest torque that is expected on a planned move
@@ -74,8 +74,6 @@ def believable_efforts(
         position: postures within the limits of the axes, shape (k, n).
         payloads: mounted in turn, None without load.
     """
-    still = np.zeros_like(position)
-    at_rest = Motion(position, still, still)
-    shares = effort_shares(expectation, effort, at_rest, payloads)
+    shares = effort_shares(expectation, effort, at_rest(position), payloads)
     is_believable = shares.max(axis=1) < 1.0
     return np.where(is_believable, effort, np.inf)

@@ -26,9 +26,9 @@ from ident.data.dataset import Dataset
 from ident.equations.currents import whitening_transform
 from ident.equations.rows import row_filter, row_masks
 from ident.model.base import BaseParameters, base_parameters
-from ident.model.bodies import LINK_PARAMETERS, Body, Payload
+from ident.model.bodies import LINK_PARAMETERS, Body, Payload, steiner
 from ident.model.model import COUPLED_COLUMNS, JOINT_COLUMNS, Model, preload_directions
-from ident.model.robot import Motion, Robot
+from ident.model.robot import Motion, Robot, each_state
 from ident.model.urdf import read_urdf
 from ident.planning.limits import JointLimits
 
@@ -106,11 +106,7 @@ def recorded(model: Model, data: Dataset, conditioning: Conditioning) -> Excitat
     """
     filter_ = row_filter(data, conditioning)
     centres = filter_.centres(len(data.time_s))
-    motion = Motion(
-        position_rad=data.position_rad[centres],
-        velocity_rad_s=data.velocity_rad_s[centres],
-        acceleration_rad_s2=data.acceleration_rad_s2[centres],
-    )
+    motion = each_state(data.motion(), lambda states: states[centres])
     _, motor_use = row_masks(model, data, conditioning)
     return Excitation(motion, motor_use)
 
@@ -476,8 +472,7 @@ def nominal_links(robot: Robot, urdf: str | None) -> tuple[FloatArray, bool]:
 def _rod(rod_m: FloatArray) -> Body:
     """A rod of LINK_MASS_KG from the origin to a point."""
     # m/12 (‖r‖² 1 − r rᵀ), and m R²/2 for its radius R
-    across = rod_m @ rod_m * np.eye(3) - np.outer(rod_m, rod_m)
-    slender = LINK_MASS_KG / 12.0 * across
+    slender = LINK_MASS_KG / 12.0 * steiner(rod_m)
     thick = 0.5 * LINK_MASS_KG * ROD_RADIUS_M**2 * np.eye(3)
     return Body(LINK_MASS_KG, 0.5 * rod_m, slender + thick)
 

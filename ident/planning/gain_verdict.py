@@ -24,7 +24,7 @@ import numpy as np
 
 from ident.arrays import FloatArray
 from ident.model.bodies import LINK_PARAMETERS
-from ident.model.robot import Motion
+from ident.model.robot import at_rest
 from ident.planning.excitation import UNSEEN_PERCENT, Design, Excitation
 from ident.plausible import format_at_limit
 
@@ -347,7 +347,8 @@ def _own_rows(design: Design, runs: Runs, whitened: Whitened) -> list[_OwnRows]:
     static_squares = np.zeros(count)
     moving_squares = np.zeros(count)
     for (excitation, _), (columns, payloads) in zip(runs, whitened, strict=True):
-        static = design.whitened(_at_rest(excitation))[:, :width]
+        still = Excitation(at_rest(excitation.motion.position_rad), excitation.use)
+        static = design.whitened(still)[:, :width]
         moving = columns[:, :width]
         static_squares += _square_sums(static[:, flange])
         moving_squares += _square_sums(moving[:, flange])
@@ -371,13 +372,6 @@ def _own_rows(design: Design, runs: Runs, whitened: Whitened) -> list[_OwnRows]:
         gravity_percent, inertia_percent = _percent_alone(unknown, known)
         judged.append(_OwnRows(gravity_percent, inertia_percent, acts))
     return judged
-
-
-def _at_rest(excitation: Excitation) -> Excitation:
-    """The same rows without velocities and accelerations."""
-    position_rad = excitation.motion.position_rad
-    still = np.zeros_like(position_rad)
-    return Excitation(Motion(position_rad, still, still), excitation.use)
 
 
 def _square_sums(columns: FloatArray) -> FloatArray:

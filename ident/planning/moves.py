@@ -16,7 +16,15 @@ from enum import Enum
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ident.arrays import FloatArray, as_array, require_count, require_kind, require_number, takes
+from ident.arrays import (
+    FloatArray,
+    as_array,
+    as_gains,
+    require_count,
+    require_kind,
+    require_number,
+    takes,
+)
 from ident.data.conditioning import Conditioning, require_cutoffs, require_settings
 from ident.errors import ModelError, PlanUnfit
 from ident.model.bodies import Payload
@@ -311,11 +319,7 @@ def plan_moves(
             "moves by hand"
         )
     count = model.robot.axis_count
-    gains = as_array("nameplate", nameplate, (count,), "one per motor")
-    if not gains.all():
-        raise ModelError(
-            f"nameplate is {gains.tolist()}; expected no zero: such a motor moves nothing"
-        )
+    gains = as_gains("nameplate", nameplate, count)
     limits.require_size(count)
     _require_followers(model.robot, limits)
     duration_s = require_number(

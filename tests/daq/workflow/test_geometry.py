@@ -378,7 +378,7 @@ def _finding(
 ) -> GeometryFinding:
     variances = [one.std**2 for one in causes]
     covariance = np.diag(variances)
-    return GeometryFinding(4e-4, 6e-6, 5e-6, True, causes, covariance, alternatives, (), ())
+    return GeometryFinding(4e-4, 6e-6, 5e-6, True, causes, covariance, alternatives, ())
 
 
 def test_what_encoders_cannot_tell_apart_is_said() -> None:

@@ -39,7 +39,7 @@ def _by_encoders(value_rad: float) -> GeometryFinding:
     parameter = GeometryParameter(GeometryKind.ZERO, "crank-2")
     correction = GeometryEstimate(parameter, value_rad, radians(STD_DEG))
     covariance = np.array([[radians(STD_DEG) ** 2]])
-    return GeometryFinding(4e-4, 6e-6, 5e-6, True, (correction,), covariance, (), (), ())
+    return GeometryFinding(4e-4, 6e-6, 5e-6, True, (correction,), covariance, (), ())
 
 
 @pytest.mark.slow

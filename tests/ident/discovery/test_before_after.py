@@ -301,9 +301,8 @@ def test_a_left_out_run_is_predicted_by_the_others_alone(
 
 
 def test_the_noise_floor_is_relative_to_the_same_currents(start: Evidence) -> None:
-    motor_noise_floor = MotorNoiseFloor(0.05, FloorSource.STANDSTILL, 20, 100.0)
-    floors = (motor_noise_floor,) * 5 + (None,)
-    floor = floor_on(start.training, start.estimate, floors)
+    noise_a = np.array([0.05] * 5 + [np.nan])
+    floor = floor_on(start.training, start.estimate, noise_a)
     error = floor.relative(start.estimate.gains)
     used = start.training.motor_use[0]
     current_a = start.training.current[0, used]

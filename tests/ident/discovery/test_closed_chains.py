@@ -18,7 +18,6 @@ from ident.discovery.candidates import prepare_search
 from ident.discovery.evidence import gather, with_effects
 from ident.discovery.gates import Gates, own_unknowns, without_effects_of
 from ident.discovery.loop import find_effects
-from ident.discovery.noise_floor import FloorSource, MotorNoiseFloor
 from ident.effects.effect import PlacedEffect
 from ident.effects.position import Spring
 from ident.equations.rows import row_filter, row_masks
@@ -202,11 +201,7 @@ def test_internal_preload_is_no_error() -> None:
     # e shows three of four shares of the noise: what it leaves, divided by these, is the noise of
     # the currents.
     assert left_on(rows, estimate) == pytest.approx(estimate.axis_noise, rel=0.02)
-    floors = [
-        MotorNoiseFloor(float(noise), FloorSource.STANDSTILL, 20, 1e4)
-        for noise in estimate.axis_noise
-    ]
-    floor = floor_on(rows, estimate, floors).relative(estimate.gains)
+    floor = floor_on(rows, estimate, estimate.axis_noise).relative(estimate.gains)
     assert floor.axes == pytest.approx(errors.in_sample.axes, rel=0.02)
     search_problem = search_problem_of(evidence)
     shown = [
