@@ -19,7 +19,7 @@ from contextlib import contextmanager, suppress
 from io import BufferedReader
 from pathlib import Path
 
-from daq.errors import FileImmutable, OwnerNotKept, WriteUnconfirmed
+from daq.errors import FileImmutable, OwnerNotKept, UsageError, WriteUnconfirmed
 
 # ioctl_iflags(2): command and bits
 _FS_IOC_GETFLAGS = 0x80086601
@@ -167,6 +167,16 @@ def is_taken(path: Path) -> bool:
     a new file of that name would replace it, or be made elsewhere.
     """
     return path.exists() or path.is_symlink()
+
+
+def require_new(path: Path, remedy: str) -> None:
+    """Refuse a name that is taken.
+
+    Raises:
+        UsageError: a file, folder or link has it.
+    """
+    if is_taken(path):
+        raise UsageError(str(path), found=what_has_name(path), expected="none", remedy=remedy)
 
 
 def what_has_name(path: Path) -> str:
