@@ -31,7 +31,7 @@ from daq.jobs.session import CALIBRATION, REPORT, Basis, Session
 from daq.log.container import UNFINISHED
 from daq.log.salvage import salvage
 from daq.report.fit import start_of
-from daq.report.residual import headline, summary
+from daq.report.residual import headline_of, summary
 from daq.report.residual_page import PAGE
 from daq.workflow.experiment import experiment_of
 from daq.workflow.fit import check_holdout
@@ -322,7 +322,7 @@ def fit_session(context: SessionContext, session: Session) -> Session:
         calibration_sha256=sha256_of(path) or "",
         sentences=summary(closed, changed, calibration.effects),
     )
-    in_short = headline(closed, changed, calibration.effects)
+    in_short = headline_of(closed, changed, calibration.effects).sentences()
     for sentence in fit.sentences:
         context.journal.say(Level.INFO, "found", text=sentence, in_short=sentence in in_short)
     return session.update(fitted=fit)
