@@ -948,7 +948,7 @@ class _Move(StrictModel):
         return self
 
 
-class _Plan(StrictModel):
+class PlanFile(StrictModel):
     """The content of a plan file."""
 
     document_kind: ClassVar[DocumentKind | None] = DocumentKind.PLAN
@@ -964,24 +964,13 @@ class _Plan(StrictModel):
     moves: Annotated[tuple[_Move, ...], Field(min_length=1, max_length=10_000)]
 
 
-@dataclass(frozen=True, slots=True)
-class PlanHead:
-    """What a plan file says of itself, its moves unread."""
-
-    cell: str  #: name of the cell it was made for
-    seed: int  #: it was made from
-    #: of each gain [% of it]; empty in plans of earlier versions
-    predicted_std_percent: tuple[float, ...]
-
-
-def plan_head(path: Path) -> PlanHead:
-    """Read what a plan file says of itself, whatever cell it is for.
+def read_plan(path: Path) -> PlanFile:
+    """Read what a plan file says, whatever cell it is for.
 
     Raises:
         ConfigurationError: the file is missing, or is no plan.
     """
-    model = read_model(parse_yaml(read_yaml_bytes(path), str(path)), _Plan)
-    return PlanHead(model.cell, model.seed, model.predicted_std_percent)
+    return read_model(parse_yaml(read_yaml_bytes(path), str(path)), PlanFile)
 
 
 def save_plan(plan: Plan, path: Path) -> None:
@@ -1059,7 +1048,7 @@ def load_plan(path: Path, cell: Cell) -> Plan:
             an hour, a way leaves the declared workspace or clearance, or the plan was made for
             another robot with the same cell name.
     """
-    model = read_model(parse_yaml(read_yaml_bytes(path), str(path)), _Plan)
+    model = read_plan(path)
     if model.cell != cell.name:
         remedy = "make a plan for this cell: `drivegain plan CELL`"
         found = f"a plan for cell {model.cell!r}"
