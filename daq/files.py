@@ -272,13 +272,7 @@ def open_regular(path: Path) -> BufferedReader:
     # Checked before it is opened: opening may rewind a tape, or wake a process at the other end of
     # a pipe.
     _check(path.stat(), path)
-    stream = os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb")
-    try:
-        _check(os.fstat(stream.fileno()), path)
-    except OSError:
-        stream.close()
-        raise
-    return stream
+    return os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb")
 
 
 def read_regular(path: Path, largest_bytes: int) -> bytes:
