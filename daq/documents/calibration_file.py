@@ -8,7 +8,6 @@ are read as the classes of `ident`.
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 import re
@@ -39,7 +38,7 @@ from daq.errors import (
     SchemaMismatch,
     YamlInvalid,
 )
-from daq.files import replace_file
+from daq.files import replace_file, sha256
 from ident.calibration import (
     AcceptedEffect,
     CalibratedRobot,
@@ -437,9 +436,7 @@ def _require_calibration(name: str, kind: DocumentKind | None) -> None:
 def _digests(body: Mapping[str, object]) -> dict[str, str]:
     """Compute the SHA-256 of each section in canonical JSON, so that an edit can be located."""
     return {
-        key: hashlib.sha256(
-            json.dumps(value, sort_keys=True, separators=(",", ":")).encode()
-        ).hexdigest()
+        key: sha256(json.dumps(value, sort_keys=True, separators=(",", ":")).encode())
         for key, value in body.items()
     }
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 import uuid
 from collections.abc import Iterator
@@ -24,7 +23,7 @@ from daq.errors import (
     RunInvalid,
     writing,
 )
-from daq.files import sha256_of
+from daq.files import sha256, sha256_of
 from daq.jobs.context import NextRun, SessionContext
 from daq.jobs.journal import Journal, Level
 from daq.jobs.session import CALIBRATION, REPORT, Basis, Session
@@ -52,8 +51,7 @@ def log_of(session: Session, name: str) -> Path:
 def basis_of(cell: Cell, section: Recalibration) -> Basis:
     """Current basis of a session of this cell; a missing plan counts as another one."""
     plans = [sha256_of(run.plan_file) or "" for run in section.runs if run.plan_file is not None]
-    digest = hashlib.sha256(" ".join(plans).encode())
-    return Basis(cell.name, cell.digest, digest.hexdigest())
+    return Basis(cell.name, cell.digest, sha256(" ".join(plans).encode()))
 
 
 def _is_unchanged(session: Session, run: RecordedRun) -> bool:
