@@ -19,7 +19,7 @@ from contextlib import contextmanager, suppress
 from io import BufferedReader
 from pathlib import Path
 
-from daq.errors import FileImmutable, OwnerNotKept, WriteUnconfirmed
+from daq.errors import FileImmutable, OwnerNotKept, UsageError, WriteUnconfirmed
 
 # ioctl_iflags(2): command and bits
 _FS_IOC_GETFLAGS = 0x80086601
@@ -169,6 +169,16 @@ def is_taken(path: Path) -> bool:
     return path.exists() or path.is_symlink()
 
 
+def require_new(path: Path, remedy: str) -> None:
+    """Refuse a name that is taken.
+
+    Raises:
+        UsageError: a file, folder or link has it.
+    """
+    if is_taken(path):
+        raise UsageError(str(path), found=what_has_name(path), expected="none", remedy=remedy)
+
+
 def what_has_name(path: Path) -> str:
     """Say what has a name that is taken: a folder, a link that leads nowhere, or a file."""
     if path.is_dir():
@@ -262,13 +272,7 @@ def open_regular(path: Path) -> BufferedReader:
     # Checked before it is opened: opening may rewind a tape, or wake a process at the other end of
     # a pipe.
     _check(path.stat(), path)
-    stream = os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb")
-    try:
-        _check(os.fstat(stream.fileno()), path)
-    except OSError:
-        stream.close()
-        raise
-    return stream
+    return os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb")
 
 
 def read_regular(path: Path, largest_bytes: int) -> bytes:

@@ -249,8 +249,9 @@ class CalibratedRobot:
     #: of joints, their kinds and order, and the motors of a closed chain, hex; as in a plan
     kinematics_sha256: str
     drives_sha256: str  #: of node id, vendor and product code of each axis, hex; as in a plan
-    joints: tuple[CalibratedJoint, ...]  #: that move, in the order of the description
-    drives: tuple[CalibratedDrive, ...]  #: one an axis
+    #: that move, in the order of the description; empty in plans of earlier versions, as `drives`
+    joints: tuple[CalibratedJoint, ...] = ()
+    drives: tuple[CalibratedDrive, ...] = ()  #: one an axis
     motors: tuple[str, ...] = ()  #: joints with a motor in a closed chain; empty for a serial robot
 
 

@@ -61,10 +61,7 @@ def export_urdf_verb(
     from daq.report.urdf_views import urdf_report, urdf_view
     from daq.workflow.urdf_export import FORMAT, parse_markup, update_urdf
 
-    given, calibration = _described_by("export urdf", cell, calibration, urdf)
-    check_output(out, (calibration, given), FORMAT)
-    known = read_calibration(calibration)
-    _require_explained(known, calibration)
+    given, known = _inputs("export urdf", FORMAT, out, cell, calibration, urdf)
     if urdf is None:
         content = bundle(given)[URDF]
     else:
@@ -119,10 +116,7 @@ def export_mjcf_verb(
     from daq.workflow.urdf_shapes import shapes_of
     from ident.model.urdf import read_urdf
 
-    given, calibration = _described_by("export mjcf", cell, calibration, urdf)
-    check_output(out, (calibration, given), FORMAT)
-    known = read_calibration(calibration)
-    _require_explained(known, calibration)
+    given, known = _inputs("export mjcf", FORMAT, out, cell, calibration, urdf)
     if urdf is None:
         described = _of_cell(known, given)
     else:
@@ -255,9 +249,9 @@ def _choose(described: _Described) -> FullChoice:
         return full_choice(known, described.model, described.limits, described.urdf, missing)
 
 
-def _described_by(
-    verb: str, cell: Path, calibration: Path | None, urdf: Path | None
-) -> tuple[Path, Path]:
+def _inputs(
+    verb: str, format_: str, out: Path, cell: Path, calibration: Path | None, urdf: Path | None
+) -> tuple[Path, Calibration]:
     """Return the file that describes the robot, and the calibration:
     of CELL CALIBRATION or CALIBRATION --urdf FILE.
     """
@@ -268,10 +262,12 @@ def _described_by(
             expected="CELL CALIBRATION, or CALIBRATION --urdf FILE for a robot without a cell file",
             remedy="give the cell file, then the calibration; or leave the cell file out",
         )
-    if urdf is not None:
-        return urdf, cell
-    assert calibration is not None  # or urdf would be given
-    return cell, calibration
+    given = urdf or cell
+    calibration_file = calibration or cell
+    check_output(out, (calibration_file, given), format_)
+    known = read_calibration(calibration_file)
+    _require_explained(known, calibration_file)
+    return given, known
 
 
 def joint_updates(robot: PhysicalRobot) -> dict[str, JointUpdate]:

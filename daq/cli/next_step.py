@@ -129,16 +129,16 @@ def _other_good_plan(plan: Path, made: Plan) -> Path | None:
     """Return the oldest plan of this cell in the folder of a plan that is good and of another
     seed.
     """
-    from daq.workflow.plan import plan_head
+    from daq.workflow.plan import read_plan
     from ident.planning.gain_verdict import GOOD_PERCENT
 
     for path in sorted(plan.parent.glob("*.yaml"), key=lambda file: file.stat().st_mtime):
         try:
-            head = plan_head(path)
+            other = read_plan(path)
         except DaqError:  # another YAML file
             continue
-        is_good = max(head.predicted_std_percent, default=float("inf")) <= GOOD_PERCENT
-        if is_good and head.cell == made.cell and head.seed != made.seed:
+        is_good = max(other.predicted_std_percent, default=float("inf")) <= GOOD_PERCENT
+        if is_good and other.cell == made.cell and other.seed != made.seed:
             return path
     return None
 

@@ -24,7 +24,7 @@ from daq.cli.verb import (
 )
 from daq.environment import login
 from daq.errors import DiskSpaceShort, ExitCode, OutputFailed, UsageError, counted
-from daq.files import is_taken, what_has_name
+from daq.files import is_taken, require_new
 from drivers.errors import POWERED, DriverError, SampleLost, all_notes, error_chain
 
 if TYPE_CHECKING:
@@ -203,12 +203,14 @@ def _free(out: Path) -> Path:
     unfinished = (
         "the rest of a recording of that name that failed, was interrupted, or is still running"
     )
-    for path, found, remedy in (
-        (out, what_has_name(out), "choose another --out, or move it away"),
-        (part, unfinished, f"`fit` does not read it; {_next_command(part)}"),
-    ):
-        if is_taken(path):
-            raise UsageError(str(path), found=found, expected="none", remedy=remedy)
+    require_new(out, "choose another --out, or move it away")
+    if is_taken(part):
+        raise UsageError(
+            str(part),
+            found=unfinished,
+            expected="none",
+            remedy=f"`fit` does not read it; {_next_command(part)}",
+        )
     return part
 
 

@@ -175,10 +175,6 @@ def bus_faults(model: CellModel, profiles: Mapping[str, DriveProfile]) -> Iterat
     if model.sync is None:
         yield Fault(("sync",), "nothing", "a sampling period, because the cell has a bus")
         return
-    if len(model.buses) > 1 and model.sync.producer != RECORDER:
-        expected = f"{RECORDER}: one SYNC must go out on all of the buses at once"
-        found = f"{model.sync.producer}, with {len(model.buses)} buses"
-        yield Fault(("sync", "producer"), found, expected)
     for drive in model.drives:
         refresh_us = profiles[drive].update_period_us
         if refresh_us > model.sync.period_us:

@@ -39,7 +39,7 @@ from daq.config.yaml_file import (
 )
 from daq.environment import shipped_configurations
 from daq.errors import ConfigurationInconsistent, ConfigurationMissing
-from drivers.profiles.profile import DriveProfile, Identity, TapPoint
+from drivers.profiles.profile import DriveProfile, TapPoint
 from ident.data.conditioning import Conditioning
 from ident.errors import ModelError
 from ident.model.bodies import LINK_PARAMETERS
@@ -357,16 +357,13 @@ def _axis(model: AxisModel, bus: str | None, profiles: Mapping[str, DriveProfile
         ampere = "A(actual)"
     else:
         ampere = "A"
-    identity = None
-    if model.identity is not None:
-        identity = Identity(**model.identity.model_dump())
     lower, upper = limits.position
     return CellAxis(
         name=model.name,
         node_id=model.node_id,
         drive=model.drive,
         profile=profile,
-        identity=identity,
+        identity=model.identity,
         bus=bus,
         counts_per_revolution=model.counts_per_revolution,
         unit=unit,

@@ -27,13 +27,13 @@ from daq.config.policy import (
 from daq.config.recalibration import RecalibrationSection
 from daq.config.workspace import ClearanceSection, WorkspaceSection
 from daq.config.yaml_file import DocumentKind, FileName, Name, Positive, StrictModel, not_in_file
+from drivers.profiles.profile import Identity
 from ident.arrays import FloatArray
 from ident.data.conditioning import FILTER_ORDER
 from ident.plausible import LEAD_MM, SPEED, within
 
 ONE_BUS = not_in_file("one bus")
 SEVERAL_BUSES = not_in_file("several buses")
-U32 = Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
 
 
 class RobotModel(ChainModel):
@@ -75,14 +75,6 @@ def buses_of(declared: UnnamedBus | tuple[Bus, ...]) -> tuple[Bus, ...]:
         return declared
     values = {key.name: getattr(declared, key.name) for key in fields(UnnamedBus)}
     return (Bus(name=declared.channel, **values),)
-
-
-class IdentityModel(StrictModel):
-    """Object 1018h; what is left out is not compared."""
-
-    vendor_id: U32  #: 1018:01 of the drive
-    product_code: U32 | None = None  #: 1018:02
-    serial: U32 | None = None  #: 1018:04; by it, two exchanged drives are noticed
 
 
 class LimitsModel(StrictModel):
@@ -140,7 +132,7 @@ class AxisModel(StrictModel):
     node_id: int | None = None  #: CANopen node of its drive
     bus: Name | None = None  #: name of its bus; of several, each axis names one
     drive: Name | None = None  #: drive profile: a shipped one, or a file relative to the cell file
-    identity: IdentityModel | None = None  #: of the drive, compared before anything moves
+    identity: Identity | None = None  #: of the drive, compared before anything moves
     #: of the motor's encoder
     counts_per_revolution: Annotated[int, Field(gt=0, le=2**31)] | None = None
     zero_offset_deg: float | None = None  #: added to the position of a revolute joint [deg]

@@ -9,7 +9,6 @@ copied cell file even the same name.
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import astuple, dataclass, fields, replace
@@ -19,6 +18,7 @@ from daq.config.cell import Cell, CellAxis
 from daq.config.cell_file import CELL, cell_from_bundle
 from daq.config.yaml_file import parse_yaml
 from daq.errors import ConfigurationInconsistent, DaqError, LogsDiffer, SchemaMismatch, first_few
+from daq.files import sha256
 from ident.calibration import CalibratedDrive, CalibratedJoint, CalibratedRobot, Calibration
 from ident.model.urdf import read_urdf
 
@@ -286,8 +286,7 @@ def mismatch_of_robot(calibration: Calibration, cell: Cell) -> Mismatch | None:
 
 
 def _sha256(content: object) -> str:
-    text = json.dumps(content)
-    return hashlib.sha256(text.encode()).hexdigest()
+    return sha256(json.dumps(content).encode())
 
 
 def mismatch_of_calibration(calibration: Calibration, cell: Cell) -> Mismatch | None:

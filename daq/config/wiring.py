@@ -15,7 +15,7 @@ from pydantic import ConfigDict, Field, TypeAdapter, ValidationError, field_vali
 
 from daq.config.cell import Bus, Cell
 from daq.config.cell_file import drive_path, load_cell
-from daq.config.cell_schema import Buses, IdentityModel, buses_of
+from daq.config.cell_schema import Buses, buses_of
 from daq.config.drive import drive_from_text
 from daq.config.yaml_file import Name, StrictModel, parse_yaml, read_model, read_yaml_bytes
 from daq.errors import ConfigurationError
@@ -131,10 +131,9 @@ def _is_node_id(value: Any) -> bool:
 
 def _identity_of(value: Any) -> Identity | None:
     try:
-        declared = TypeAdapter(IdentityModel).validate_python(value)
+        return TypeAdapter(Identity).validate_python(value)
     except ValidationError:
         return None
-    return Identity(declared.vendor_id, declared.product_code, declared.serial)
 
 
 def _profile_of(cell_file: Path, drive: Any) -> tuple[DriveProfile | None, str]:

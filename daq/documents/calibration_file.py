@@ -2,12 +2,12 @@
 written whole, read strictly, and every edit by hand is detected.
 
 The file adds percentages for people and writes NaN as null. Sections without such a difference
-(`Source`, `Recording`, `Diagnosis`, `CalibratedRobot`) are read as the classes of `ident`.
+(`Source`, `Recording`, `Diagnosis`, `CalibratedRobot`, `PayloadMass`, `EncoderMisfit`, `FullSet`)
+are read as the classes of `ident`.
 """
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 import re
@@ -38,15 +38,13 @@ from daq.errors import (
     SchemaMismatch,
     YamlInvalid,
 )
-from daq.files import replace_file
+from daq.files import replace_file, sha256
 from ident.calibration import (
     AcceptedEffect,
     CalibratedRobot,
     Calibration,
     EncoderMisfit,
     Gain,
-    GeometryCorrection,
-    MassInfluence,
     Parameter,
     PayloadMass,
     Source,
@@ -54,7 +52,7 @@ from ident.calibration import (
 from ident.data.conditioning import FILTER_ORDER
 from ident.errors import Diagnosis
 from ident.estimators.estimate import RelativeError
-from ident.physical.full_set import FullParameter, FullSet, GainWithPrior
+from ident.physical.full_set import FullSet
 
 if TYPE_CHECKING:  # reading a calibration needs no effects
     from ident.effects.effect import Effect
@@ -133,89 +131,6 @@ class EffectEntry(StrictModel):
     package: str | None = None  # likewise
 
 
-class MassInfluenceEntry(StrictModel):
-    """What the mass of a payload does to one gain."""
-
-    axis: str
-    per_kg: _Number
-    percent_per_percent: _Number
-    tolerance_std: _Positive
-
-
-class PayloadMassEntry(StrictModel):
-    """One payload of which the mass is known."""
-
-    payload: str
-    mass_kg: Annotated[float, Field(gt=0.0, le=_LARGEST)]
-    tolerance_kg: _Positive
-    gains: tuple[MassInfluenceEntry, ...]
-    parameters_per_kg: tuple[_Number, ...] = ()  # files of earlier versions lack it
-
-
-class GeometryCorrectionEntry(StrictModel):
-    """One number of the robot's description that the encoders contradict."""
-
-    kind: Literal["zero", "length", "place"]
-    joint: str
-    end: str
-    described: _Number
-    change: _Number
-    std: _Positive
-    unit: Literal["rad", "m"]
-
-
-class EncoderMisfitEntry(StrictModel):
-    """How well redundant encoders fit the loops of the robot."""
-
-    described: _Positive
-    left: _Positive
-    unit: str
-    significant: bool
-    corrections: tuple[GeometryCorrectionEntry, ...]
-    applied: bool
-    alternatives: tuple[str, ...]
-    unobservable: tuple[str, ...]
-    noise: _Positive | None = None  # files of earlier versions lack it
-    late_encoders: str = ""  # likewise
-
-
-class FullParameterEntry(StrictModel):
-    """One standard parameter under a prior."""
-
-    name: str
-    value: _Number
-    std: _Positive
-    unit: str
-    basis: Literal["data", "prior"]
-    prior_share: Annotated[float, Field(ge=0.0, le=1.0)]
-    prior: _Number | None
-    prior_std: _Positive | None
-
-
-class GainWithPriorEntry(StrictModel):
-    """What the prior would make of a gain."""
-
-    axis: str
-    value: _Number
-    std: _Positive
-
-
-class FullSetEntry(StrictModel):
-    """All standard parameters under a prior on the links."""
-
-    urdf: str
-    urdf_sha256: str
-    tolerance: _Positive
-    parameters: tuple[FullParameterEntry, ...]
-    gains: tuple[GainWithPriorEntry, ...]
-    bounded: bool
-    chi_square: _Positive
-    degrees_of_freedom: _Positive
-    mass_ratio: _Number | None
-    mass_ratio_std: _Positive | None
-    contradictions: tuple[str, ...]
-
-
 class CalibrationBody(StrictModel):
     """Schema of a calibration, without the envelope of a file;
     its keys are in the order of `Calibration`.
@@ -243,15 +158,17 @@ class CalibrationBody(StrictModel):
     diagnoses: tuple[Diagnosis, ...] = ()
     current_residual: tuple[_Positive, ...] | None = None
     passive_joints: tuple[str, ...] = ()
-    payload_mass: tuple[PayloadMassEntry, ...] = ()
-    encoder_misfit: EncoderMisfitEntry | None = None
-    full_parameters: FullSetEntry | None = None
+    payload_mass: tuple[PayloadMass, ...] = ()
+    encoder_misfit: EncoderMisfit | None = None
+    full_parameters: FullSet | None = None
     robot: CalibratedRobot | None = None
 
     @model_validator(mode="after")
-    def _check_axes_of_payload_mass(self) -> Self:
+    def _check_payload_mass(self) -> Self:
         axes = [gain.axis for gain in self.gains]
         for one in self.payload_mass:
+            if one.mass_kg <= 0.0 or one.tolerance_kg < 0.0:
+                raise ValueError(f"payload_mass of {one.payload} above 0, and no tolerance below 0")
             if [influence.axis for influence in one.gains] != axes:
                 raise ValueError(
                     f"payload_mass of {one.payload} with an entry for each of the axes "
@@ -280,13 +197,6 @@ _CLASSES: dict[type, type] = {
     GainEntry: Gain,
     ParameterEntry: Parameter,
     EffectEntry: AcceptedEffect,
-    MassInfluenceEntry: MassInfluence,
-    PayloadMassEntry: PayloadMass,
-    GeometryCorrectionEntry: GeometryCorrection,
-    EncoderMisfitEntry: EncoderMisfit,
-    FullParameterEntry: FullParameter,
-    GainWithPriorEntry: GainWithPrior,
-    FullSetEntry: FullSet,
 }
 
 
@@ -526,9 +436,7 @@ def _require_calibration(name: str, kind: DocumentKind | None) -> None:
 def _digests(body: Mapping[str, object]) -> dict[str, str]:
     """Compute the SHA-256 of each section in canonical JSON, so that an edit can be located."""
     return {
-        key: hashlib.sha256(
-            json.dumps(value, sort_keys=True, separators=(",", ":")).encode()
-        ).hexdigest()
+        key: sha256(json.dumps(value, sort_keys=True, separators=(",", ":")).encode())
         for key, value in body.items()
     }
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from enum import Enum
 from typing import Annotated, Literal
 
@@ -238,3 +239,10 @@ class GuidedState(SessionState):
         """Whether no command goes on with it: what was written must be accepted, too."""
         lacks_acceptance = self.outcome is Outcome.APPLIED and self.acceptance is None
         return super().is_over and not lacks_acceptance
+
+
+def finite(number: float) -> float | None:
+    """Return a number as a state has it: None for NaN and infinity."""
+    if math.isfinite(number):
+        return number
+    return None

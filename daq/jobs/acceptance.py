@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from daq.config.recalibration import PlannedRun
-from daq.documents.session_state import Acceptance, Outcome, ScaleOfAxis
+from daq.documents.session_state import Acceptance, Outcome, ScaleOfAxis, finite
 from daq.errors import ControllerChanged
 from daq.files import sha256_of
 from daq.jobs.context import NextRun, SessionContext, before_motion
@@ -144,7 +143,7 @@ def judge_acceptance(context: SessionContext, session: Session) -> Acceptance:
     scales = []
     rows = zip(context.cell.axis_names, axis_scales(before), axis_scales(after), strict=True)
     for axis, (old, _), (new, std) in rows:
-        scale = ScaleOfAxis(axis=axis, old=_finite(old), new=_finite(new), std=_finite(std))
+        scale = ScaleOfAxis(axis=axis, old=finite(old), new=finite(new), std=finite(std))
         scales.append(scale)
     off = [one for one in scales if not _is_right(one)]
     remark = (
@@ -157,8 +156,8 @@ def judge_acceptance(context: SessionContext, session: Session) -> Acceptance:
     return Acceptance(
         log_sha256=sha256_of(log_of(session, RUN)) or "",
         scales=tuple(scales),
-        old_error_percent=_finite(before.error.total),
-        new_error_percent=_finite(after.error.total),
+        old_error_percent=finite(before.error.total),
+        new_error_percent=finite(after.error.total),
         accepted=not off,
         remark=remark,
     )
@@ -205,12 +204,6 @@ def axis_scales(found: Validation) -> list[tuple[float, float]]:
         variance = (PIECES - 1) / PIECES * float(np.sum(deviation**2))
         scales.append((scale, float(np.sqrt(variance))))
     return scales
-
-
-def _finite(number: float) -> float | None:
-    if math.isfinite(number):
-        return number
-    return None
 
 
 def _predicted(calibration: Calibration, context: SessionContext, session: Session) -> Validation:

@@ -4,22 +4,19 @@ and the cache of results.
 
 from __future__ import annotations
 
-import hashlib
 import json
-import math
 import re
 import tempfile
 import time
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from datetime import datetime
 from enum import Enum
 from pathlib import Path
-
-from pydantic import TypeAdapter
+from typing import Literal
 
 from daq.advice import for_command_line
-from daq.config.yaml_file import MAX_BYTES
+from daq.config.yaml_file import MAX_BYTES, StrictModel
 from daq.documents.calibration_file import as_document, decode_calibration, encode_calibration
 from daq.environment import software
 from daq.errors import (
@@ -32,7 +29,7 @@ from daq.errors import (
     exit_code,
     writing,
 )
-from daq.files import judge_target, read_regular, replace_file
+from daq.files import judge_target, read_regular, replace_file, sha256
 from daq.jobs.fleet_survey import CellLogs, SeenLog, StoredLog, at_hand, fingerprint
 from daq.workflow.fit import BOOTSTRAP_SEED, calibration_of, check_holdout, close_loop, fit
 from drivers.errors import DriverError
@@ -160,8 +157,16 @@ def failure_of(error: BaseException, paths: Mapping[Path, StoredLog] | None = No
 
 
 STATE_VERSION = 1
-FORMAT = "drivegain-fleet-state"
-_SUMMARY = TypeAdapter(Summary)
+
+
+class CachedFit(StrictModel):
+    """What a cached calibration was made of, and its summary."""
+
+    format: Literal["drivegain-fleet-state"] = "drivegain-fleet-state"
+    inputs_sha256: str
+    calibration_sha256: str
+    seconds: float
+    summary: Summary
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,24 +199,14 @@ class CalibrationCache:
             _check_replaceable(path)
         try:
             # Read without waiting for a pipe, and no more than a calibration can have.
-            state = json.loads(read_regular(file.with_suffix(".json"), MAX_BYTES))
-            wanted = (
-                FORMAT,
-                self._inputs(cell),
-                hashlib.sha256(read_regular(file, MAX_BYTES)).hexdigest(),
-            )
-            if (state["format"], state["inputs_sha256"], state["calibration_sha256"]) != wanted:
-                return None
-            found = _SUMMARY.validate_python(state["summary"]), float(state["seconds"])
-        except (OSError, ValueError, KeyError, TypeError, RecursionError):
+            state = read_regular(file.with_suffix(".json"), MAX_BYTES)
+            found = CachedFit.model_validate_json(state)
+            digest = sha256(read_regular(file, MAX_BYTES))
+        except (OSError, ValueError):
             return None  # unreadable: made again
-        summary, seconds = found
-        numbers = [summary.error_percent, seconds]
-        for gain in summary.gains:
-            numbers += (gain.value, gain.std, gain.nameplate)
-        if all(map(math.isfinite, numbers)):
-            return found
-        return None
+        if (found.inputs_sha256, found.calibration_sha256) != (self._inputs(cell), digest):
+            return None
+        return found.summary, found.seconds
 
     def store(self, cell: CellLogs, fitted: FleetFit) -> Path:
         """Store a calibration; after a kill at any point,
@@ -221,15 +216,14 @@ class CalibrationCache:
             OutputFailed: the file system refuses.
         """
         file = self.file(cell)
-        state = {
-            "format": FORMAT,
-            "inputs_sha256": self._inputs(cell),
-            "calibration_sha256": hashlib.sha256(fitted.content).hexdigest(),
-            "seconds": fitted.seconds,
-            "summary": asdict(fitted.summary),
-        }
+        state = CachedFit(
+            inputs_sha256=self._inputs(cell),
+            calibration_sha256=sha256(fitted.content),
+            seconds=fitted.seconds,
+            summary=fitted.summary,
+        )
         state_file = file.with_suffix(".json")
-        contents = {file: fitted.content, state_file: json.dumps(state, indent=1).encode()}
+        contents = {file: fitted.content, state_file: state.model_dump_json(indent=1).encode()}
         for path, content in contents.items():
             with writing(path):
                 replace_file(path, content)
@@ -249,7 +243,7 @@ class CalibrationCache:
             cell.configuration_sha256,
             logs,
         )
-        return hashlib.sha256(json.dumps(decisive).encode()).hexdigest()
+        return sha256(json.dumps(decisive).encode())
 
 
 def _input(role: str, seen: SeenLog) -> tuple[str, str, str, str | None]:

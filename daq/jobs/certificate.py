@@ -11,10 +11,8 @@ from __future__ import annotations
 import shlex
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Literal
 
 from daq.config.cell import Cell
-from daq.config.yaml_file import StrictModel
 from daq.errors import writing
 from daq.files import read_regular, replace_file
 from daq.jobs.session import CALIBRATION, REPORT
@@ -29,15 +27,6 @@ from ident.discovery.before_after import Account
 
 DETAILS = "details.json"  #: Next to the page
 LARGEST_BYTES = 64 << 20  #: Of the details; drawings of a long session take a few megabytes
-
-
-class StoredDetails(StrictModel):
-    """The details of a page in their file."""
-
-    format: Literal["drivegain-page-details"] = "drivegain-page-details"
-    version: Literal[1] = 1
-    consequence: str
-    sections: tuple[str, ...]
 
 
 def save_certificate(
@@ -63,8 +52,7 @@ def save_certificate(
     """
     session = folder.parent
     comparison = _compared(cell_file, cell, calibration, session, datetime.now(UTC))
-    found = page_details(fitted, changed, calibration)
-    details = StoredDetails(consequence=found.consequence, sections=found.sections)
+    details = page_details(fitted, changed, calibration)
     with writing(folder / DETAILS):
         replace_file(folder / DETAILS, details.model_dump_json().encode())
     save_report(fitted, changed, calibration, folder, comparison, session=session.name)
@@ -99,10 +87,9 @@ def renew_certificate(
 def read_details(path: Path) -> PageDetails:
     """Return the details of a page; none where their file is missing or cannot be read."""
     try:
-        stored = StoredDetails.model_validate_json(read_regular(path, LARGEST_BYTES))
+        return PageDetails.model_validate_json(read_regular(path, LARGEST_BYTES))
     except (OSError, ValueError):
-        return PageDetails("", ())
-    return PageDetails(stored.consequence, stored.sections)
+        return PageDetails(consequence="", sections=())
 
 
 def _compared(

@@ -210,29 +210,6 @@ class Fitter(Protocol):
         """As `daq.workflow.fit.fit`."""
 
 
-class BlockReader(Protocol):
-    """Reads what the log of a block shows."""
-
-    def __call__(self, cell: Cell, log: Path, earlier: Sequence[Path]) -> BlockFacts:
-        """As `daq.jobs.block_check.look_at_block`."""
-
-
-class GeometryJudge(Protocol):
-    """Judges the described geometry by logs."""
-
-    def __call__(self, cell: Cell, logs: Sequence[Path]) -> Diagnosis | None:
-        """As `daq.jobs.block_check.look_at_geometry`."""
-
-
-class Validator(Protocol):
-    """Predicts logs with a calibration."""
-
-    def __call__(
-        self, calibration: Calibration, logs: Sequence[Path], cell: Cell
-    ) -> tuple[Validation, ...]:
-        """As `daq.workflow.validate.validate`."""
-
-
 class ChangeWriter(Protocol):
     """Writes what was planned."""
 
@@ -255,8 +232,10 @@ class Tools:
     #: writes a page that shows a plan, from its file
     preview: Callable[[Cell, Plan, Path, Path], None] = save_preview
     record: Recorder = record
-    look: BlockReader = look_at_block
-    geometry: GeometryJudge = look_at_geometry
+    #: reads what the log of a block shows
+    look: Callable[[Cell, Path, Sequence[Path]], BlockFacts] = look_at_block
+    #: judges the described geometry by logs
+    geometry: Callable[[Cell, Sequence[Path]], Diagnosis | None] = look_at_geometry
     fit: Fitter = fit
     close_loop: Callable[[Fit, int, Callable[[str], None]], Fit] = close_loop
     calibration: Callable[[Fit, datetime], Calibration] = calibration_of
@@ -264,7 +243,8 @@ class Tools:
     network: NetworkMaker = network_of  #: opens the drives that hold gains
     propose: Callable[[Target[Any], Request], Proposal[Any]] = propose
     apply: ChangeWriter = apply
-    validate: Validator = validate
+    #: predicts logs with a calibration
+    validate: Callable[[Calibration, Sequence[Path], Cell], tuple[Validation, ...]] = validate
     certify: Callable[[Path, Cell, Calibration, Path, datetime], Certificate] = renew_certificate
     run: Runner = run_command  #: runs a command of the cell
     free: FreeBytes = free_bytes  #: free bytes of a folder's disk

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from datetime import datetime
 from typing import Any
 
 from daq.documents.calibration_file import read_calibration_bytes
-from daq.documents.session_state import Decision, JudgedGain, Outcome, PlannedWrite
+from daq.documents.session_state import Decision, JudgedGain, Outcome, PlannedWrite, finite
 from daq.errors import writing
 from daq.files import replace_file, sha256, sha256_of
 from daq.jobs.context import SessionContext
@@ -201,8 +200,8 @@ def decision_of(proposal: Proposal[Any], known: Spread) -> Decision:
             new=change.new,
             old_std=known.stds[change.axis],
             new_std=change.std,
-            change_percent=_finite(drift.percent),
-            drift_sigma=_finite(drift.sigmas),
+            change_percent=finite(drift.percent),
+            drift_sigma=finite(drift.sigmas),
             differs=drift.significant,
         )
         gains.append(gain)
@@ -246,9 +245,3 @@ def _write_proposal(session: Session, proposal: Proposal[Any], after_sha256: str
         path = session.folder / name
         with writing(path):
             replace_file(path, content.encode())
-
-
-def _finite(number: float) -> float | None:
-    if math.isfinite(number):
-        return number
-    return None

@@ -14,7 +14,7 @@ from importlib.util import find_spec
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from daq.config.cell_file import cell_from_bundle
+from daq.config.cell_file import cell_from_bundle, digest
 from daq.errors import ConfigurationMissing, DaqError, LogMissing, LogUnreadable
 from daq.files import open_regular
 from daq.log.metadata import READBACK
@@ -219,14 +219,14 @@ def survey(logs: Sequence[StoredLog]) -> tuple[SeenLog | UnknownLog, ...]:
         try:
             mark = fingerprint(log)
             head = _head(log)
-            cell, digest = _described(log, head, known)
+            cell, cell_sha256 = _described(log, head, known)
         except DaqError as error:
             found.append(UnknownLog(log, error))
             continue
         mounting = None
         if head.run.payload is not None:
             mounting = head.run.payload.mounting
-        found.append(SeenLog(log, mark, cell, digest, mounting, head.run.started_wall_ns))
+        found.append(SeenLog(log, mark, cell, cell_sha256, mounting, head.run.started_wall_ns))
     return tuple(found)
 
 
@@ -243,24 +243,21 @@ def by_cell(seen: Iterable[SeenLog]) -> tuple[CellLogs, ...]:
     for log in sorted(seen, key=lambda log: (log.started_ns, log.fingerprint, log.log.name)):
         groups.setdefault((log.cell, log.configuration_sha256), []).append(log)
     cells = []
-    for (cell, digest), logs in sorted(groups.items()):
+    for (cell, cell_sha256), logs in sorted(groups.items()):
         mountings = [log.mounting for log in logs]
         loaded = [log for log in logs if log.mounting is not None]
         holdout: list[SeenLog] = []
         if None in mountings and loaded and mountings.count(loaded[-1].mounting) > 1:
             holdout = loaded[-1:]
         used = tuple(log for log in logs if log not in holdout)
-        cells.append(CellLogs(cell, digest, used, tuple(holdout)))
+        cells.append(CellLogs(cell, cell_sha256, used, tuple(holdout)))
     return tuple(cells)
 
 
 def _described(log: StoredLog, head: LogHead, known: dict[str, tuple[str, str]]) -> tuple[str, str]:
     """Name and digest of a configuration; one that several logs share is read once."""
     files = {name: data for name, data in head.files.items() if name != READBACK}
-    total = hashlib.sha256()
-    for name, data in sorted(files.items()):
-        total.update(f"{name}\0{len(data)}\0".encode() + data)
-    key = total.hexdigest()
+    key = digest(files)
     if key not in known:
         cell = cell_from_bundle(files, names={"cell.yaml": f"{log.address}, cell.yaml"})
         known[key] = cell.name, cell.digest

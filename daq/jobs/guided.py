@@ -514,7 +514,6 @@ class Rehearse:
     """
 
     schedule: UntilPrecise
-    speed: float = REHEARSAL_SPEED  #: share of the planned speed
 
     def run(self, context: SessionContext, session: Session) -> Session:
         """Go on after the last block that was rehearsed;
@@ -531,10 +530,12 @@ class Rehearse:
             path = session.folder / plan_name(number)
             planned = PlannedRun(name=f"rehearsal-{number + 1}", plan_file=path)
             session, moves = self.schedule.plan_block(context, session, planned.name, number, path)
-            plan = slowed(context.cell, moves, self.speed)
+            plan = slowed(context.cell, moves, REHEARSAL_SPEED)
             context.operator.mount(planned)
-            context.journal.say(Level.INFO, "rehearsing", speed=self.speed, seconds=plan.duration_s)
-            move_without_log(context, session, NextRun(planned, plan), self.speed)
+            context.journal.say(
+                Level.INFO, "rehearsing", speed=REHEARSAL_SPEED, seconds=plan.duration_s
+            )
+            move_without_log(context, session, NextRun(planned, plan), REHEARSAL_SPEED)
             session = session.update(rehearsed=number + 1)
         return session
 

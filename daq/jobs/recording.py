@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 import uuid
 from collections.abc import Iterator
@@ -24,14 +23,14 @@ from daq.errors import (
     RunInvalid,
     writing,
 )
-from daq.files import sha256_of
+from daq.files import sha256, sha256_of
 from daq.jobs.context import NextRun, SessionContext
 from daq.jobs.journal import Journal, Level
 from daq.jobs.session import CALIBRATION, REPORT, Basis, Session
 from daq.log.container import UNFINISHED
 from daq.log.salvage import salvage
 from daq.report.fit import start_of
-from daq.report.residual import headline, summary
+from daq.report.residual import headline_of, summary
 from daq.report.residual_page import PAGE
 from daq.workflow.experiment import experiment_of
 from daq.workflow.fit import check_holdout
@@ -52,8 +51,7 @@ def log_of(session: Session, name: str) -> Path:
 def basis_of(cell: Cell, section: Recalibration) -> Basis:
     """Current basis of a session of this cell; a missing plan counts as another one."""
     plans = [sha256_of(run.plan_file) or "" for run in section.runs if run.plan_file is not None]
-    digest = hashlib.sha256(" ".join(plans).encode())
-    return Basis(cell.name, cell.digest, digest.hexdigest())
+    return Basis(cell.name, cell.digest, sha256(" ".join(plans).encode()))
 
 
 def _is_unchanged(session: Session, run: RecordedRun) -> bool:
@@ -322,7 +320,7 @@ def fit_session(context: SessionContext, session: Session) -> Session:
         calibration_sha256=sha256_of(path) or "",
         sentences=summary(closed, changed, calibration.effects),
     )
-    in_short = headline(closed, changed, calibration.effects)
+    in_short = headline_of(closed, changed, calibration.effects).sentences()
     for sentence in fit.sentences:
         context.journal.say(Level.INFO, "found", text=sentence, in_short=sentence in in_short)
     return session.update(fitted=fit)

@@ -4,7 +4,6 @@ the metrics and the journal.
 
 from __future__ import annotations
 
-import hashlib
 import re
 import shlex
 from collections.abc import Callable
@@ -27,7 +26,7 @@ from daq.errors import (
     exit_code,
     writing,
 )
-from daq.files import replace_file
+from daq.files import replace_file, sha256
 from daq.jobs import session as sessions
 from daq.jobs.context import SessionContext
 from daq.jobs.guided import fit_corrected_command, go_on, next_step_after
@@ -521,7 +520,7 @@ def file_stem(cell: str) -> str:
     plain = re.sub(r"[^A-Za-z0-9_-]+", "_", cell)
     if plain == cell:
         return plain
-    return f"{plain}_{hashlib.sha256(cell.encode()).hexdigest()[:6]}"
+    return f"{plain}_{sha256(cell.encode())[:6]}"
 
 
 def _set_session_gauges(gauge: Callable[..., Gauge], state: SessionState, cell: str) -> None:

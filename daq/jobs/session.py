@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Collection, Iterable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Collection, Iterable
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -66,15 +66,26 @@ def sessions(folder: Path, cell: str | None = None) -> tuple[Session, ...]:
     Raises:
         ConfigurationInconsistent: it is no folder, or cannot be read.
     """
+    try:
+        entries = tuple(folder.iterdir())
+    except FileNotFoundError:
+        return ()
+    except OSError as error:
+        raise ConfigurationInconsistent(
+            str(folder),
+            found=reason_of(error),
+            expected="the folder of a cell's sessions",
+            remedy="correct `recalibration.folder` of the cell file, or move that file away",
+        ) from error
     found: list[Session] = []
-    with suppress(FileNotFoundError), _listing(folder):
-        folders = [entry for entry in folder.iterdir() if _NAME.fullmatch(entry.name)]
-        for entry in folders:
-            state = _read(entry / STATE)
-            if state is None:
-                continue
-            if cell is None or state.cell == cell:
-                found.append(Session(entry, state))
+    for entry in entries:
+        if not _NAME.fullmatch(entry.name):
+            continue
+        state = _read(entry / STATE)
+        if state is None:
+            continue
+        if cell is None or state.cell == cell:
+            found.append(Session(entry, state))
     return tuple(sorted(found, key=lambda session: (session.began, session.folder.name)))
 
 
@@ -131,21 +142,6 @@ def session_of(calibration: Path, digest: str) -> str | None:
     if state is None or state.fitted is None or state.fitted.calibration_sha256 != digest:
         return None
     return state.session
-
-
-@contextmanager
-def _listing(folder: Path) -> Iterator[None]:
-    try:
-        yield
-    except FileNotFoundError:
-        raise
-    except OSError as error:
-        raise ConfigurationInconsistent(
-            str(folder),
-            found=reason_of(error),
-            expected="the folder of a cell's sessions",
-            remedy="correct `recalibration.folder` of the cell file, or move that file away",
-        ) from error
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import re
 import shlex
@@ -12,6 +11,7 @@ from pathlib import Path
 from daq.config.cell import Cell
 from daq.config.recalibration import Recalibration
 from daq.errors import ExitCode, UsageError
+from daq.files import sha256
 
 MARK = "# Made by `drivegain schedule`, which may replace this file."
 """First line of a unit that drivegain made."""
@@ -98,7 +98,7 @@ def unit_name(cell: Cell) -> str:
     plain = re.sub(r"[^a-z0-9]+", "-", cell.name.lower()).strip("-")
     digest = ""
     if plain != cell.name:
-        digest = "-" + hashlib.sha256(cell.name.encode()).hexdigest()[:6]
+        digest = "-" + sha256(cell.name.encode())[:6]
     return f"drivegain-recalibrate-{plain or 'cell'}{digest}"
 
 

@@ -18,8 +18,8 @@ from mcap.writer import CompressionType, Writer
 
 from daq.config.cell import Cell, joint_names
 from daq.config.same_cell import require_cell_of
-from daq.errors import ConfigurationInconsistent, OutputFailed, UsageError
-from daq.files import fsync_folder, is_taken, what_has_name
+from daq.errors import ConfigurationInconsistent, OutputFailed
+from daq.files import fsync_folder, require_new
 from daq.log.conversion import continuous_counts, scaling
 from daq.log.message import (
     CURRENTS_TOPIC,
@@ -75,13 +75,7 @@ def export_bag(path: Path, out: Path, calibration: Calibration | None = None) ->
         ConfigurationInconsistent: the calibration is of another cell than the log.
         LogUnreadable: the log is damaged or incomplete; nothing is written.
     """
-    if is_taken(out):
-        raise UsageError(
-            str(out),
-            found=what_has_name(out),
-            expected="none",
-            remedy="choose another --out",
-        )
+    require_new(out, "choose another --out")
     log = read_log(path)
     cell = log.head.cell(path)
     gains = []

@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daq.config.cell import Cell, CellAxis
-from daq.errors import ConfigurationMissing, OutputFailed, UsageError
-from daq.files import is_taken, what_has_name
+from daq.errors import ConfigurationMissing, OutputFailed
+from daq.files import require_new
 from daq.log.conversion import answers, moves, readings_by_axis, scaling, unwrapped
 from daq.log.message import RawArray
 from daq.log.motion import judge_log
@@ -94,13 +94,7 @@ def require_new_table(out: Path, kind: TableFormat) -> None:
             expected="that of the optional extra `parquet`",
             remedy="pip install 'drivegain[parquet]', or export --csv",
         )
-    if is_taken(out):
-        raise UsageError(
-            str(out),
-            found=what_has_name(out),
-            expected="none",
-            remedy="choose another --out, or move it away",
-        )
+    require_new(out, "choose another --out, or move it away")
 
 
 def write_table(

@@ -22,7 +22,6 @@ from collections import deque
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from dataclasses import asdict, dataclass, field
-from math import inf
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -190,33 +189,17 @@ def read_packet(packet: bytes, axes: int | None) -> Packet:
         kind, number, samples, lost, missing, count = HEAD.unpack_from(packet)
         message = None
         rows = None
+        fits = kind in (SAMPLES, TEXT)
         if kind == TEXT:
             message = _MESSAGE.validate_json(packet[HEAD.size :])
-            fits = _fits(message, axes)
-        else:
-            fits = kind == SAMPLES
-            if axes is not None:
-                rows = np.frombuffer(packet, packet_dtype(axes), offset=HEAD.size)
-                fits = fits and len(rows) == count > 0
+        elif axes is not None:
+            rows = np.frombuffer(packet, packet_dtype(axes), offset=HEAD.size)
+            fits = fits and len(rows) == count > 0
     except (struct.error, ValueError) as error:
         raise FeedUnfit("it sends packets that this version does not understand") from error
     if not fits:
         raise FeedUnfit("it sends packets whose numbers do not fit together")
     return Packet(number, samples, lost, missing, message, rows)
-
-
-def _fits(message: Message, axes: int | None) -> bool:
-    run = message.run
-    count = axes or 0
-    if run is not None:
-        count = len(run.axes)
-        if len(run.to_joint) != count or not 0.0 < run.rate_hz < inf:
-            return False
-        by_axis = [run.rad_per_count, run.current_per_unit, run.offset_rad, *run.to_joint]
-        if any(len(values) != count for values in by_axis):
-            return False
-    event_axes = [event.axis for event in message.events if event.axis is not None]
-    return all(0 <= axis < count for axis in event_axes)
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,7 +19,7 @@ from mcap.writer import CompressionType, Writer
 
 from daq.config.cell import Cell, joint_names
 from daq.errors import OutputFailed, UsageError, reason_of
-from daq.files import fsync_folder, is_taken, what_has_name
+from daq.files import fsync_folder, require_new
 from daq.log.container import UNFINISHED
 from daq.log.message import (
     CURRENTS_TOPIC,
@@ -140,13 +140,7 @@ class LogWriter:
 
     def __enter__(self) -> LogWriter:
         """Open the file and write everything before the first sample."""
-        if is_taken(self.path):
-            raise UsageError(
-                str(self.path),
-                found=what_has_name(self.path),
-                expected="none",
-                remedy="choose another name, or move it away",
-            )
+        require_new(self.path, "choose another name, or move it away")
         try:
             self._stream = self._new_part()
         except FileExistsError as error:

@@ -40,7 +40,7 @@ from daq.report.picture import (
 )
 from daq.report.text import SHOWN_SIGMAS, inert_row, plain_table, printable
 from daq.writeback.file_access import resolve_links
-from ident.calibration import Gain
+from daq.writeback.request import is_writable
 from ident.drift.change import CHART
 
 if TYPE_CHECKING:
@@ -555,15 +555,11 @@ def describe_actions(
     return described
 
 
-def _is_known(gain: Gain) -> bool:
-    return math.isfinite(gain.value) and math.isfinite(gain.std) and gain.value != 0.0
-
-
 def _has(entry: Entry, numbers: dict[str, tuple[Scalar, float]]) -> bool:
     """Whether a write of this calibration would change no number."""
     if {gain.axis for gain in entry.gains} != numbers.keys():
         return False
-    if not all(_is_known(gain) for gain in entry.gains):
+    if not all(map(is_writable, entry.gains)):
         return False
     try:
         put = []

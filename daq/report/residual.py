@@ -292,22 +292,15 @@ def summary(fitted: Fit, account: Account, effects: Sequence[AcceptedEffect]) ->
         account: of these turns.
         effects: of the calibration, with the errors that the gate of an effect compares.
     """
-    return (*headline(fitted, account, effects), *statistical_sentences(fitted, account))
-
-
-def headline(fitted: Fit, account: Account, effects: Sequence[AcceptedEffect]) -> tuple[str, ...]:
-    """What to check first, each accepted effect, all axes together, the gains,
-    and what held-out runs refute.
-
-    The arguments are those of `summary`. The diagnoses come first, a sentence each.
-    """
-    return headline_of(fitted, account, effects).sentences()
+    headline = headline_of(fitted, account, effects).sentences()
+    return (*headline, *statistical_sentences(fitted, account))
 
 
 def headline_of(fitted: Fit, account: Account, effects: Sequence[AcceptedEffect]) -> Headline:
-    """Return the sentences of `headline` by their subject.
+    """Say what to check first, each accepted effect, all axes together, the gains,
+    and what held-out runs refute.
 
-    The arguments are those of `summary`.
+    The arguments are those of `summary`. The diagnoses come first, a sentence each.
     """
     in_model = fitted.steps[-1].after.effects
     checks = list(diagnosis_texts(fitted.diagnoses))

@@ -6,11 +6,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
+from typing import Literal
 
 from daq.config.cell import Cell
+from daq.config.yaml_file import StrictModel
 from daq.errors import writing
 from daq.files import replace_file
 from daq.ledger.ledger import Standing
@@ -120,10 +122,11 @@ def residual_page(
     return certificate_page(certificate, details.consequence, details.sections)
 
 
-@dataclass(frozen=True, slots=True)
-class PageDetails:
-    """What a page shows of a closed loop, in addition to the calibration."""
+class PageDetails(StrictModel):
+    """What a page shows of a closed loop, in addition to the calibration; a session keeps it."""
 
+    format: Literal["drivegain-page-details"] = "drivegain-page-details"
+    version: Literal[1] = 1
     consequence: str  #: what the effects change in the gains, a sentence
     sections: tuple[str, ...]  #: folded sections, HTML
 
@@ -151,7 +154,7 @@ def page_details(fitted: Fit, account: Account, calibration: Calibration) -> Pag
         *turns,
         _limits(fitted, calibration),
     )
-    return PageDetails(gains_sentence(fitted, account), sections)
+    return PageDetails(consequence=gains_sentence(fitted, account), sections=sections)
 
 
 def _errors(fitted: Fit, account: Account) -> str:

@@ -222,13 +222,7 @@ class DemoStages:
         """
         cell = self._cell
         out = self._settings.out
-        if cell.controller is None or cell.controller_path is None:
-            raise UsageError(
-                "the demo cell",
-                found="no controller",
-                expected="one",
-                remedy="install drivegain again",
-            )
+        assert cell.controller_path is not None  # the shipped cell has a controller
         controller_copy = out / CONTROLLER_COPY
         replace_file(controller_copy, cell.controller_path.read_bytes())
         masses_kg = {payload.name: payload.mass_kg for payload in cell.payloads}

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from daq.config.cell import Cell
-from daq.workflow.experiment import CheckedScene, PlannedMove, paths_of
+from daq.workflow.experiment import CheckedScene, PlannedMove, paths_of, point_of
 from daq.workflow.plan import Plan, TargetBox
 from ident.arrays import FloatArray
 from ident.model.robot import poses
@@ -50,8 +50,8 @@ class AcceptedRoom:
         if self.reach is None:
             return scene
         capsules = scene.checker.scene.capsules
-        lower_m = _corner(self.reach.lower_m - SLACK_M)
-        upper_m = _corner(self.reach.upper_m + SLACK_M)
+        lower_m = point_of(self.reach.lower_m - SLACK_M)
+        upper_m = point_of(self.reach.upper_m + SLACK_M)
         reach = Box("the reach of the moves that were accepted", lower_m, upper_m)
         moving = [index for index, capsule in enumerate(capsules) if capsule.link != BASE]
         bounded = replace(scene.checker.scene, workspace=reach, confined=tuple(moving))
@@ -126,7 +126,3 @@ def extent(checker: Checker, ends_m: FloatArray) -> Extent:
     upper = highest.max(axis=(0, 1, 2))
     from_axis_m = np.hypot(ends[..., 0], ends[..., 1]) + radius_m
     return Extent(lower, upper, float(from_axis_m.max()))
-
-
-def _corner(point_m: FloatArray) -> tuple[float, float, float]:
-    return float(point_m[0]), float(point_m[1]), float(point_m[2])

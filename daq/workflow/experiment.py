@@ -109,8 +109,8 @@ def scene_of(cell: Cell, robot: Robot, mass_kg: float) -> CheckedScene:
         side = side_of_cube(mass_kg)
         axis = robot.joints[last].axis
         at = robot.mounting_m
-        begin = _point(at + side * axis)
-        end = _point(at + 2.0 * side * axis)
+        begin = point_of(at + side * axis)
+        end = point_of(at + 2.0 * side * axis)
         capsules = (
             *capsules,
             Capsule(PAYLOAD, last, begin, end, side),
@@ -182,11 +182,12 @@ def guessed_capsules(robot: Robot) -> tuple[Capsule, ...]:
             name = "base"
         else:
             name = f"link {joint.parent + 1}"
-        capsules.append(Capsule(name, joint.parent, (0.0, 0.0, 0.0), _point(end), radius))
+        capsules.append(Capsule(name, joint.parent, (0.0, 0.0, 0.0), point_of(end), radius))
     return tuple(capsules)
 
 
-def _point(vector: FloatArray) -> tuple[float, float, float]:
+def point_of(vector: FloatArray) -> tuple[float, float, float]:
+    """Return a vector as a place."""
     return float(vector[0]), float(vector[1]), float(vector[2])
 
 

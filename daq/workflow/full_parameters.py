@@ -5,13 +5,13 @@ the inertias of a URDF, and how far they may be off.
 from __future__ import annotations
 
 import functools
-import hashlib
 from collections.abc import Iterator
 
 import numpy as np
 
 from daq.config.cell import Cell, model_of
 from daq.errors import ConfigurationInconsistent, UsageError
+from daq.files import sha256
 from daq.workflow.diagnoses import by_likelihood
 from daq.workflow.fit import Fit
 from ident.arrays import FloatArray
@@ -75,11 +75,10 @@ def full_set(fitted: Fit, urdf: str, name: str, tolerance: float) -> FullSet:
     check = found.check
     is_mass_seen = bool(np.isfinite(check.mass_ratio_std))
     joints = [joint.name for joint in final.model.robot.joints]
-    digest = hashlib.sha256(urdf.encode()).hexdigest()
     parameters = tuple(_parameters(found, of_links))
     return FullSet(
         urdf=name,
-        urdf_sha256=digest,
+        urdf_sha256=sha256(urdf.encode()),
         tolerance=tolerance,
         parameters=parameters,
         gains=gains,

@@ -53,7 +53,7 @@ from daq.workflow.experiment import (
 from drivers.errors import MotionRefused
 from drivers.move import Trapezoid
 from ident.arrays import FloatArray
-from ident.calibration import CalibratedDrive, CalibratedJoint, CalibratedRobot
+from ident.calibration import CalibratedRobot
 from ident.model.robot import Robot
 from ident.planning.clear_way import clear_way
 from ident.planning.clearance import CLOSURES, WORKSPACE_END, Checker, Obstruction
@@ -930,7 +930,6 @@ LEAST_VELOCITY = 0.01  #: Share of the limits; slower than that a move would har
 LEAST_ACCELERATION = 0.0001
 Velocity = Annotated[float, Field(ge=LEAST_VELOCITY, le=1)]
 Acceleration = Annotated[float, Field(ge=LEAST_ACCELERATION, le=1)]
-Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 
 
 class _Move(StrictModel):
@@ -949,46 +948,7 @@ class _Move(StrictModel):
         return self
 
 
-class _Joint(StrictModel):
-    name: str
-    kind: str
-    parent: str
-
-
-class _Drive(StrictModel):
-    axis: str
-    node_id: int | None
-    vendor_id: int | None
-    product_code: int | None
-
-
-class _Robot(StrictModel):
-    """The robot in a plan file."""
-
-    kinematics_sha256: Digest
-    drives_sha256: Digest
-    # Plans of earlier versions have the digests alone.
-    joints: tuple[_Joint, ...] = ()
-    drives: tuple[_Drive, ...] = ()
-    motors: tuple[str, ...] = ()
-
-    @property
-    def robot(self) -> CalibratedRobot:
-        """The robot."""
-        joints = []
-        for joint in self.joints:
-            joints.append(CalibratedJoint(joint.name, joint.kind, joint.parent))
-        drives = []
-        for drive in self.drives:
-            drives.append(
-                CalibratedDrive(drive.axis, drive.node_id, drive.vendor_id, drive.product_code)
-            )
-        return CalibratedRobot(
-            self.kinematics_sha256, self.drives_sha256, tuple(joints), tuple(drives), self.motors
-        )
-
-
-class _Plan(StrictModel):
+class PlanFile(StrictModel):
     """The content of a plan file."""
 
     document_kind: ClassVar[DocumentKind | None] = DocumentKind.PLAN
@@ -1000,28 +960,17 @@ class _Plan(StrictModel):
     # Plans of earlier versions have none.
     predicted_std_percent: tuple[Annotated[float, Field(gt=0)], ...] = ()
     purpose: str = ""
-    robot: _Robot | None = None
+    robot: CalibratedRobot | None = None
     moves: Annotated[tuple[_Move, ...], Field(min_length=1, max_length=10_000)]
 
 
-@dataclass(frozen=True, slots=True)
-class PlanHead:
-    """What a plan file says of itself, its moves unread."""
-
-    cell: str  #: name of the cell it was made for
-    seed: int  #: it was made from
-    #: of each gain [% of it]; empty in plans of earlier versions
-    predicted_std_percent: tuple[float, ...]
-
-
-def plan_head(path: Path) -> PlanHead:
-    """Read what a plan file says of itself, whatever cell it is for.
+def read_plan(path: Path) -> PlanFile:
+    """Read what a plan file says, whatever cell it is for.
 
     Raises:
         ConfigurationError: the file is missing, or is no plan.
     """
-    model = read_model(parse_yaml(read_yaml_bytes(path), str(path)), _Plan)
-    return PlanHead(model.cell, model.seed, model.predicted_std_percent)
+    return read_model(parse_yaml(read_yaml_bytes(path), str(path)), PlanFile)
 
 
 def save_plan(plan: Plan, path: Path) -> None:
@@ -1099,12 +1048,12 @@ def load_plan(path: Path, cell: Cell) -> Plan:
             an hour, a way leaves the declared workspace or clearance, or the plan was made for
             another robot with the same cell name.
     """
-    model = read_model(parse_yaml(read_yaml_bytes(path), str(path)), _Plan)
+    model = read_plan(path)
     if model.cell != cell.name:
         remedy = "make a plan for this cell: `drivegain plan CELL`"
         found = f"a plan for cell {model.cell!r}"
         raise _refused(str(path), found, f"one for {cell.name!r}", remedy)
-    robot = _robot_of(path, model.robot, cell)
+    _require_robot(path, model.robot, cell)
     if len(model.predicted_std_percent) not in (0, len(cell.axes)):
         found = f"{len(model.predicted_std_percent)} numbers"
         remedy = "make the plan anew: `drivegain plan CELL`"
@@ -1129,18 +1078,15 @@ def load_plan(path: Path, cell: Cell) -> Plan:
         moves=moves,
         units=tuple(axis.unit for axis in cell.axes),
         purpose=model.purpose,
-        robot=robot,
+        robot=model.robot,
     )
 
 
-def _robot_of(path: Path, stated: _Robot | None, cell: Cell) -> CalibratedRobot | None:
-    """Return the robot that a plan is for, None for a plan of an earlier version;
-    refuse that of another robot.
-    """
-    if stated is None:
-        return None
-    found = stated.robot
-    differences = robot_differences(found, calibrated_robot(cell))
+def _require_robot(path: Path, robot: CalibratedRobot | None, cell: Cell) -> None:
+    """Refuse a plan of another robot; one of an earlier version may not say whose it is."""
+    if robot is None:
+        return
+    differences = robot_differences(robot, calibrated_robot(cell))
     if differences:
         raise _refused(
             f"{path}: robot",
@@ -1150,7 +1096,6 @@ def _robot_of(path: Path, stated: _Robot | None, cell: Cell) -> CalibratedRobot 
             "give the cell file that the plan was made with, or make a plan for this cell: "
             "`drivegain plan CELL`",
         )
-    return found
 
 
 def _target_key(units: tuple[JointUnit, ...]) -> str:

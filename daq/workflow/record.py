@@ -26,7 +26,7 @@ from daq.config.cell_file import bundle
 from daq.config.drive import shipped_profiles
 from daq.config.policy import Permission
 from daq.environment import software
-from daq.errors import ConfigurationInconsistent, ControllerUnfit, DiskSpaceShort
+from daq.errors import ControllerUnfit, DiskSpaceShort
 from daq.files import sha256
 from daq.formats.document import read_controller_file
 from daq.log.conversion import SiScaling, scaling
@@ -812,18 +812,8 @@ def stream_losses(statistics: StreamStatistics) -> str:
 
 
 def _sync(cell: Cell) -> declared.Sync:
-    """Return the SYNC that the cell file declares.
-
-    Raises:
-        ConfigurationInconsistent: it declares none.
-    """
-    if cell.sync is None:
-        raise ConfigurationInconsistent(
-            f"cell {cell.name!r}",
-            found="no `sync`",
-            expected="its period and pacing",
-            remedy="complete the cell file",
-        )
+    """Return the SYNC of a cell with a bus: its cell file declares one."""
+    assert cell.sync is not None
     return cell.sync
 
 
@@ -834,10 +824,8 @@ def _sync_producer(
 
     On one SocketCAN bus the kernel sends it for this program, which a busy computer delays.
     """
-    sync = cell.sync
+    sync = _sync(cell)
     address = network.link.address
-    if sync is None:
-        return nullcontext()
     if sync.producer == declared.KERNEL:
         return KernelProducer(network, sync.period_us)
     if sync.producer == declared.RECORDER:

@@ -502,7 +502,7 @@ def build_effect(
         passive: joints without a motor, whose coordinates follow those of the axes.
 
     Raises:
-        SpecInvalid: the name, a parameter or the axis does not exist, or a parameter is missing.
+        SpecInvalid: the name, a parameter or the joint does not exist, or a parameter is missing.
     """
     if effect.name == PIVOT_FRICTION:
         return _pivot_friction(effect)
@@ -524,10 +524,6 @@ def build_effect(
                 f"{effect.name}: joint {effect.joint} has no motor; name an axis, J1 to J{axes}"
             )
         joint = axes + passive.index(effect.joint)
-    elif not 0 <= effect.axis < axes:
-        raise SpecInvalid(
-            f"{effect.name}: axis {effect.axis + 1} does not exist; the cell has axes 1 to {axes}"
-        )
     _require_parameters(effect, physics)
     other_axis = effect.parameters.get("other_axis")
     others = set(range(1, axes + 1)) - {joint + 1}

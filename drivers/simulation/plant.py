@@ -132,11 +132,9 @@ def reduction(ratio: FloatArray) -> FloatArray:
     """Return the reduction N of each motor, shape (n,): that of its own joint, or else its largest.
 
     Raises:
-        SpecInvalid: the matrix is not square or not invertible.
+        SpecInvalid: the matrix is not invertible.
     """
-    if ratio.ndim != 2 or ratio.shape[0] != ratio.shape[1]:
-        raise SpecInvalid(f"the drive train must be a square matrix, found shape {ratio.shape}")
-    if not np.isfinite(ratio).all() or np.linalg.matrix_rank(ratio) < len(ratio):
+    if np.linalg.matrix_rank(ratio) < len(ratio):
         raise SpecInvalid(f"the drive train must be invertible, found {ratio.tolist()}")
     own = np.diag(ratio)
     largest = ratio[np.arange(len(own)), np.argmax(np.abs(ratio), axis=1)]
@@ -243,21 +241,15 @@ class Plant:
         self.set_brakes(np.ones(n, dtype=np.bool_))
 
     def _require_one_size(self, spec: CellSpec) -> None:
-        """Refuse a URDF, a drive train and a start position of different numbers of axes.
+        """Refuse a URDF of another number of joints; a closed chain has passive ones as well.
 
         Raises:
-            SpecInvalid: they are.
+            SpecInvalid: it is one.
         """
         n = len(spec.axes)
         joints = self._model.nv
-        # A closed chain has passive joints as well.
-        fits = self.mechanism is not None or joints == n
-        if not fits or spec.ratio.shape != (n, n) or spec.start_rad.shape != (n,):
-            raise SpecInvalid(
-                f"{n} axes, a URDF of {joints} joints, a drive train of shape {spec.ratio.shape} "
-                f"and a start position of shape {spec.start_rad.shape}; all must have the same "
-                "number of axes"
-            )
+        if self.mechanism is None and joints != n:
+            raise SpecInvalid(f"{n} axes and a URDF of {joints} joints; they must be as many")
 
     def _build_effects(self, spec: CellSpec, passive_joints: tuple[str, ...]) -> list[Effect | Lag]:
         """Build the undeclared effects; pivots with friction learn how they turn with the joints.

@@ -372,5 +372,4 @@ def test_a_replaced_file_is_named_and_an_unrelated_one_is_not(
     said = capsys.readouterr().err
     assert "Replaced: plan.yaml (of" in said
     assert "Replaced: plan.html (of" in said
-    head = plan_module.plan_head(Path("plan.yaml"))
-    assert head.seed == 1
+    assert plan_module.read_plan(Path("plan.yaml")).seed == 1

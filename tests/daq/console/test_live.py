@@ -59,7 +59,6 @@ def _run(cell: Cell, **changed: Any) -> dict[str, Any]:
         pytest.param(
             lambda _: _text({"events": [{**EVENT, "kind": "surprise"}]}), id="an unknown event"
         ),
-        pytest.param(lambda _: _text({"events": [{**EVENT, "axis": 9}]}), id="an event of axis 9"),
         pytest.param(
             lambda cell: _text(
                 {"run": {k: v for k, v in _run(cell)["run"].items() if k != "moves"}}
@@ -69,10 +68,6 @@ def _run(cell: Cell, **changed: Any) -> dict[str, Any]:
         pytest.param(
             lambda cell: _text({"run": asdict(facts(replace(cell, axes=cell.axes[:5]), None))}),
             id="a run of five axes",
-        ),
-        pytest.param(lambda cell: _text(_run(cell, rate_hz=0.0)), id="a run of no rate"),
-        pytest.param(
-            lambda cell: _text(_run(cell, rad_per_count=[1.0])), id="a run with a short list"
         ),
         pytest.param(lambda cell: _samples(len(cell.axes), 2), id="too many samples"),
         pytest.param(lambda cell: _samples(len(cell.axes) - 1, 1), id="samples of fewer axes"),

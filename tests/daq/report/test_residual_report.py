@@ -47,7 +47,7 @@ from daq.report.residual import (
     candidate_rows,
     error_change_text,
     gains_sentence,
-    headline,
+    headline_of,
     residual_view,
     statistical_sentences,
     summary,
@@ -160,7 +160,7 @@ class Closed:
 
     def headline(self) -> tuple[str, ...]:
         """Sentences of `residual` before a calibration has effects."""
-        return headline(self.fitted, self.account, ())
+        return headline_of(self.fitted, self.account, ()).sentences()
 
     def summary(self) -> tuple[str, ...]:
         """Sentences of `residual --verbose` before a calibration has effects."""

@@ -526,8 +526,6 @@ def test_unknown_names_and_parameters_are_refused_with_what_exists() -> None:
     stribeck = {"rise": 1.0, "speed_rad_s": 0.1}
     message = r"unknown parameter rise; missing parameter rise_nm; .* rise_nm, speed_rad_s"
     _refuse("stribeck", 0, stribeck, message)
-    spring = {"stiffness_nm_per_rad": 1.0, "rest_rad": 0.0}
-    _refuse("spring", 6, spring, "axis 7")
     coupling = {"other_axis": 4, "coulomb_nm": 0.4, "viscous_nm_s_rad": 0.3}
     _refuse("coupling", 3, coupling, "other_axis")
     cable = {
