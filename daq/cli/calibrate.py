@@ -53,6 +53,7 @@ YES = "yes"  #: What the operator types to write
 KEEP = "keep"  #: What the operator types where a block shows a mistake and is right all the same
 SHOWN_WITHIN_S = 0.5  #: A terminal that takes longer for a question was stopped
 MOVES = "moves"  #: Unit of the progress of a block
+LONGEST_ANSWER = 60  #: Characters of an answer that are shown; someone may paste a whole page
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,7 +131,7 @@ class Person:
         tell("")
         tell(f"── {run.name}: {on_flange(run)} ──", bold=True)
         if self.asks_before_motion:
-            ask("Check the flange, leave the cell, press Enter")
+            ask_enter("Check the flange, leave the cell, press Enter")
 
     def weigh(self, payload: str) -> float:
         """Ask for the mass from the scale, twice, until both are the same and that of the cell
@@ -158,7 +159,7 @@ class Person:
                 "motion is disabled", expected="permission", remedy="pass --enable-motion"
             )
         if self.asks_before_motion:
-            ask("The robot moves now: Enter starts it, Ctrl-C stops")
+            ask_enter("The robot moves now: Enter starts it, Ctrl-C stops")
         return self.who
 
     def record_again(self, run: PlannedRun, blocks: Sequence[str], mistake: str) -> bool:
@@ -203,6 +204,28 @@ def tell(text: str, *, bold: bool = False) -> None:
     typer.secho(printable(text), err=True, bold=bold)
 
 
+def ask_enter(question: str) -> None:
+    """Ask the operator for Enter alone.
+
+    Any other line is no permission: it may be a *no*, or meant for another window.
+
+    Raises:
+        JobHeld: as `ask`.
+    """
+    while answer := ask(question):
+        tell(
+            f"Found {in_short(answer)}, expected Enter alone. Nothing moves: press Enter to go on, "
+            "or Ctrl-C to stop."
+        )
+
+
+def in_short(answer: str) -> str:
+    """Return what was typed in quotes, of a long line its start."""
+    if len(answer) > LONGEST_ANSWER:
+        answer = f"{answer[:LONGEST_ANSWER]}…"
+    return repr(answer)
+
+
 def ask_word(question: str, word: str) -> bool:
     """Ask the operator for one word; return whether it was typed, in letters of either case.
 
@@ -218,7 +241,7 @@ def ask_word(question: str, word: str) -> bool:
             return True
         if answer.casefold() in {"", "no"}:
             return False
-        tell(f"Found {answer!r}, expected {word}, or Enter alone.")
+        tell(f"Found {in_short(answer)}, expected {word}, or Enter alone.")
 
 
 def ask(question: str) -> str:

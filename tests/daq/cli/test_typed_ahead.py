@@ -16,9 +16,11 @@ from typing import TextIO
 
 import pytest
 
-from daq.cli.calibrate import SHOWN_WITHIN_S, ask
+from daq.cli.calibrate import SHOWN_WITHIN_S, Person, ask
+from daq.config.recalibration import PlannedRun
 from daq.errors import JobHeld
 from tests.daq.cli.screens import full_pipe, printing_to
+from tests.daq.drives import demo_cell
 
 SECONDS_TO_WAIT = 20.0  #: For what takes milliseconds
 
@@ -109,6 +111,29 @@ def test_the_lines_of_a_pipe_are_answers(monkeypatch: pytest.MonkeyPatch, tmp_pa
         assert ask("Type yes") == "yes"
         with pytest.raises(JobHeld):
             ask("Anything else")
+
+
+@pytest.mark.parametrize("answer", ["no", "stop", "yes", "é\x7f", "x" * 100_000])
+def test_a_line_that_is_not_empty_does_not_permit_motion(
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    answer: str,
+) -> None:
+    """A robot must not move because its operator has typed *no*."""
+    cell = demo_cell(tmp_path)
+    person = Person(cell, "operator", may_move=True, asks_before_motion=True)
+    run = PlannedRun(name="block-1-bare", plan_file=Path("plan.yaml"))
+    lines = tmp_path / "lines"
+    lines.write_text(f"{answer}\n \n{answer}\n", encoding="utf-8")
+    with lines.open(encoding="utf-8") as pipe:
+        monkeypatch.setattr(sys, "stdin", pipe)
+        assert person.permit_motion(run) == "operator"  # by the second line, a blank one
+        with pytest.raises(JobHeld, match="no answer: the input has ended"):
+            person.mount(run)
+    shown = capsys.readouterr().err
+    assert shown.count("expected Enter alone. Nothing moves") == 2
+    assert len(shown) < 1000
 
 
 def test_an_answer_to_a_question_that_went_nowhere_starts_nothing(
