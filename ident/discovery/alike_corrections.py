@@ -17,7 +17,7 @@ from ident.discovery.candidates import SearchProblem
 from ident.discovery.search import Finding
 from ident.effects.effect import PlacedEffect
 from ident.effects.geometry_corrections import GravityDirection, LatePosition, ZeroOffset
-from ident.model.robot import JointKind, Robot
+from ident.model.robot import JointKind, Robot, joints_to_base
 
 OWN_SHARE = 0.5  #: Of what a correction explains alone, that it must explain beside another effect
 WIDE_RAD = float(np.deg2rad(120.0))  #: Range of a joint that turns the arm behind it enough
@@ -95,11 +95,10 @@ def axes_to_move(
 def axes_before(axis: int, robot: Robot) -> tuple[int, ...]:
     """Axes whose joints are before that of an axis on its chain, the last one first."""
     before: list[int] = []
-    joint = robot.joints[robot.axis_joints[axis]].parent
-    while joint >= 0:
+    own = robot.joints[robot.axis_joints[axis]]
+    for joint in joints_to_base(robot, own.parent):
         if joint in robot.axis_joints:
             before.append(robot.axis_joints.index(joint))
-        joint = robot.joints[joint].parent
     return tuple(before)
 
 

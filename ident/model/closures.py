@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ident.arrays import FloatArray
-from ident.model.robot import Closure, JointKind, Place, Poses, Robot, poses
+from ident.model.robot import Closure, JointKind, Place, Poses, Robot, joints_to_base, poses
 
 _AFTER = {"x": "y", "y": "z", "z": "x"}
 _INDEX = {"x": 0, "y": 1, "z": 2}
@@ -41,9 +41,7 @@ def loops(
     """
     samples = len(position)
     placed = poses(robot, position)
-    axes_of_joints = np.array([joint.axis for joint in robot.joints])
-    columns = axes_of_joints[:, None, :, None]
-    axes = (placed.rotation[1:] @ columns)[..., 0]
+    axes = joint_axes(robot, placed)
     width = len(robot.couplings)
     for closure in robot.closures:
         width += len(closure.directions)
@@ -53,7 +51,7 @@ def loops(
         moved = None
         bias = np.empty((samples, 0))
     else:
-        moved = _spin(robot, placed, axes, position, velocity)
+        moved = spin(robot, placed, axes, velocity)
         bias = np.empty((samples, width))
     first = 0
     for closure in robot.closures:
@@ -97,7 +95,7 @@ def with_followers(robot: Robot, position: FloatArray) -> FloatArray:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Spin:
+class Spin:
     """Motion of every link without joint accelerations, in the base frame, (n + 1, k, 3) each."""
 
     angular: FloatArray  #: ω
@@ -106,11 +104,16 @@ class _Spin:
     linear_bias: FloatArray  #: its origin's acceleration
 
 
-def _spin(
-    robot: Robot, placed: Poses, axes: FloatArray, position: FloatArray, velocity: FloatArray
-) -> _Spin:
-    """Motion of every link, from the base outwards."""
-    shape = (robot.joint_count + 1, len(position), 3)
+def joint_axes(robot: Robot, placed: Poses) -> FloatArray:
+    """Axes of all joints in the base, shape (n, k, 3)."""
+    axes = np.array([joint.axis for joint in robot.joints])
+    columns = axes[:, None, :, None]
+    return np.asarray((placed.rotation[1:] @ columns)[..., 0])
+
+
+def spin(robot: Robot, placed: Poses, axes: FloatArray, velocity: FloatArray) -> Spin:
+    """Motion of every link, from the base outwards; axes are `joint_axes`."""
+    shape = (robot.joint_count + 1, len(velocity), 3)
     w = np.zeros(shape)
     v = np.zeros(shape)
     dw = np.zeros(shape)
@@ -132,7 +135,7 @@ def _spin(
         else:
             v[i] += along
             dv[i] += 2.0 * _cross(w[p], along)
-    return _Spin(w, v, dw, dv)
+    return Spin(w, v, dw, dv)
 
 
 _NEXT = np.array([1, 2, 0])  #: Component after each one
@@ -165,13 +168,11 @@ def _columns(
     linear = np.zeros_like(axes)
     angular = np.zeros_like(axes)
     revolute: list[int] = []
-    joint = place.joint
-    while joint >= 0:
+    for joint in joints_to_base(robot, place.joint):
         if robot.joints[joint].kind is JointKind.REVOLUTE:
             revolute.append(joint)
         else:
             linear[joint] = axes[joint]
-        joint = robot.joints[joint].parent
     arms = origin(placed, place) - placed.origin_m[1:][revolute]
     angular[revolute] = axes[revolute]
     linear[revolute] = _cross(axes[revolute], arms)
@@ -179,7 +180,7 @@ def _columns(
 
 
 def _closure(
-    robot: Robot, closure: Closure, placed: Poses, axes: FloatArray, moved: _Spin | None
+    robot: Robot, closure: Closure, placed: Poses, axes: FloatArray, moved: Spin | None
 ) -> Loops:
     """φ, J and J̇ q̇ of one closure, in m and rad.
 
@@ -245,7 +246,7 @@ def _dot(a: FloatArray, b: FloatArray) -> FloatArray:
     return np.asarray(np.einsum("ki,ki->k", a, b))
 
 
-def _gap_acceleration(moved: _Spin, placed: Poses, closure: Closure, gap: FloatArray) -> FloatArray:
+def _gap_acceleration(moved: Spin, placed: Poses, closure: Closure, gap: FloatArray) -> FloatArray:
     """Acceleration of p₂ − p₁ in the first frame, without joint accelerations, shape (k, 3)."""
     v1, dv1 = _place_motion(moved, placed, closure.first)
     v2, dv2 = _place_motion(moved, placed, closure.second)
@@ -259,7 +260,7 @@ def _gap_acceleration(moved: _Spin, placed: Poses, closure: Closure, gap: FloatA
 
 
 def _relative_turn(
-    moved: _Spin, closure: Closure, to_frame: FloatArray
+    moved: Spin, closure: Closure, to_frame: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Angular velocity of the second frame in the first, and its rate without accelerations."""
     first = closure.first.joint + 1
@@ -286,7 +287,7 @@ def _parallel_axes(directions: tuple[str, ...], about: str) -> tuple[int, int]:
     return _INDEX[last], _INDEX[following]
 
 
-def _place_motion(moved: _Spin, placed: Poses, place: Place) -> tuple[FloatArray, FloatArray]:
+def _place_motion(moved: Spin, placed: Poses, place: Place) -> tuple[FloatArray, FloatArray]:
     """Velocity of a frame's origin, and its acceleration with all joint accelerations zero."""
     at = place.joint + 1
     arm = placed.rotation[at] @ place.translation_m

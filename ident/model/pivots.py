@@ -25,8 +25,8 @@ import numpy as np
 from ident.arrays import FloatArray
 from ident.errors import ModelError
 from ident.model.closed_chain import CLOSED, MAX_ITERATIONS, Assembly, assemble, null_space
-from ident.model.closures import loops
-from ident.model.robot import Closure, JointKind, Motion, Pivot, Poses, Robot, poses
+from ident.model.closures import joint_axes, loops, spin
+from ident.model.robot import Closure, JointKind, Motion, Pivot, Poses, Robot, joints_to_base, poses
 
 #: Difference of two joints' speeds, relative to the largest, below which they turn alike
 ALIKE = 1e-7
@@ -93,12 +93,12 @@ def pivot_rates(robot: Robot, position_rad: FloatArray) -> FloatArray:
     if not robot.pivots:
         return rates
     placed = poses(robot, position_rad)
+    axes = joint_axes(robot, placed)
     for number, pivot in enumerate(robot.pivots):
         about = _axis(robot, placed, pivot)
         loop = _loop(robot, robot.closures[pivot.closure])
         for joint, sign in loop.items():
-            axis = _joint_axis(robot, placed, joint)
-            along = np.einsum("ki,ki->k", about, axis)  # a · a_j
+            along = np.einsum("ki,ki->k", about, axes[joint])  # a · a_j
             rates[:, number, joint] = sign * along
     return rates
 
@@ -126,7 +126,8 @@ def pivot_motion(robot: Robot, assembly: Assembly, joints: Motion) -> Motion:
         return Motion(position, velocity, acceleration)
     placed = poses(robot, joints.position_rad)
     assembled = poses(robot, assembly.position_rad[None])
-    turning = _angular_velocities(robot, placed, joints.velocity_rad_s)
+    axes = joint_axes(robot, placed)
+    turning = spin(robot, placed, axes, joints.velocity_rad_s).angular
     for number, pivot in enumerate(robot.pivots):
         middle = _angle(robot, assembled, pivot)
         away = _angle(robot, placed, pivot) - middle
@@ -137,8 +138,7 @@ def pivot_motion(robot: Robot, assembly: Assembly, joints: Motion) -> Motion:
         for joint, sign in loop.items():
             parent = robot.joints[joint].parent
             of_parent = turning[parent + 1]
-            axis = _joint_axis(robot, placed, joint)
-            own = axis * joints.velocity_rad_s[:, joint, None]
+            own = axes[joint] * joints.velocity_rad_s[:, joint, None]
             turned = np.cross(of_parent, own)
             along = np.einsum("ki,ki->k", about, turned)  # a · (ω × a_j q̇_j)
             acceleration[:, number] += sign * along
@@ -172,9 +172,10 @@ def _is_planar(robot: Robot, pivot: Pivot) -> bool:
     """
     placed = poses(robot, np.zeros((1, robot.joint_count)))
     about = _axis(robot, placed, pivot)
+    axes = joint_axes(robot, placed)
     loop = _loop(robot, robot.closures[pivot.closure])
     for joint in loop:
-        across = np.cross(about, _joint_axis(robot, placed, joint))
+        across = np.cross(about, axes[joint])
         if np.linalg.norm(across) > PARALLEL:
             return False
     return True
@@ -186,18 +187,10 @@ def _loop(robot: Robot, closure: Closure) -> dict[int, float]:
     """
     signs: dict[int, float] = {}
     for place, sign in ((closure.second, 1.0), (closure.first, -1.0)):
-        joint = place.joint
-        while joint >= 0:
+        for joint in joints_to_base(robot, place.joint):
             if robot.joints[joint].kind is JointKind.REVOLUTE:
                 signs[joint] = signs.get(joint, 0.0) + sign
-            joint = robot.joints[joint].parent
     return {joint: sign for joint, sign in signs.items() if sign != 0.0}
-
-
-def _joint_axis(robot: Robot, placed: Poses, joint: int) -> FloatArray:
-    """Axis of a joint in the base, shape (k, 3)."""
-    in_link = robot.joints[joint].axis
-    return np.asarray(placed.rotation[joint + 1] @ in_link)
 
 
 def _axis(robot: Robot, placed: Poses, pivot: Pivot) -> FloatArray:
@@ -220,17 +213,6 @@ def _angle(robot: Robot, placed: Poses, pivot: Pivot) -> FloatArray:
     sine = turned[:, last, following]
     cosine = turned[:, following, following]
     return np.asarray(np.arctan2(sine, cosine))
-
-
-def _angular_velocities(robot: Robot, placed: Poses, velocity_rad_s: FloatArray) -> FloatArray:
-    """Angular velocity of the base and of every link, shape (n + 1, k, 3)."""
-    turning = np.zeros((robot.joint_count + 1, len(velocity_rad_s), 3))
-    for index, joint in enumerate(robot.joints):
-        turning[index + 1] = turning[joint.parent + 1]
-        if joint.kind is JointKind.REVOLUTE:
-            axis = _joint_axis(robot, placed, index)
-            turning[index + 1] += axis * velocity_rad_s[:, index, None]
-    return turning
 
 
 def _speeds_near(robot: Robot, assembly: Assembly) -> FloatArray:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from typing import TYPE_CHECKING, TypeVar
@@ -382,6 +382,13 @@ def poses(robot: Robot, position_rad: FloatArray) -> Poses:
             origin[here] += position_rad[:, index, None] * direction
         np.matmul(parent, own[index], out=rotation[here])
     return Poses(rotation, origin)
+
+
+def joints_to_base(robot: Robot, joint: int) -> Iterator[int]:
+    """A joint and those before it, to the base; none of the base itself, -1."""
+    while joint >= 0:
+        yield joint
+        joint = robot.joints[joint].parent
 
 
 def _own_rotations(robot: Robot, position_rad: FloatArray) -> FloatArray:

@@ -20,7 +20,7 @@ import numpy as np
 
 from ident.arrays import BoolArray, FloatArray
 from ident.model.closed_chain import assemble, reach
-from ident.model.robot import JointKind, Robot, poses
+from ident.model.robot import JointKind, Robot, joints_to_base, poses
 
 _Point = tuple[float, float, float]
 BASE = -1  #: Index of the link that does not move
@@ -397,14 +397,9 @@ class Checker:
 
     def _chain(self, body: int) -> list[int]:
         """Joints from a body to the base; none of a box."""
-        chain: list[int] = []
         if body >= len(self.scene.capsules):
-            return chain
-        link = self.scene.capsules[body].link
-        while link != BASE:
-            chain.append(link)
-            link = self.robot.joints[link].parent
-        return chain
+            return []
+        return list(joints_to_base(self.robot, self.scene.capsules[body].link))
 
 
 def _pairs_with_boxes(scene: Scene) -> list[tuple[int, int]]:
