@@ -372,7 +372,7 @@ class _Problem:
 
     def _closed(self, robot: Robot, axes_rad: FloatArray) -> FloatArray:
         """Poses of another geometry that fit the encoders best, shape (k, n)."""
-        return reach_near(robot, self.model.assembly, self.near_rad, axes_rad).position_rad
+        return reach_near(robot, self.model.assembly, self.near_rad, axes_rad)
 
     def _apart(self, axes_rad: FloatArray, position_rad: FloatArray) -> FloatArray:
         """e of poses, shape (k (m − d),)."""

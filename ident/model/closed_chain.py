@@ -407,7 +407,7 @@ def reach(robot: Robot, assembly: Assembly, axes_rad: FloatArray) -> Reach:
             near = np.repeat(found, len(finer), axis=0)
         coarse = finer
         found, gap, condition = _newton(robot, assembly, near, axes_rad[finer])
-    misfit = _largest_misfit(found[:, motors], axes_rad)
+    misfit = np.max(np.abs(found[:, motors] - axes_rad), axis=1)
     return Reach(found, gap, misfit, condition)
 
 
@@ -417,15 +417,9 @@ def _every(stride: int, samples: int) -> IntArray:
     return np.unique(np.append(indices, samples - 1))
 
 
-def _largest_misfit(found_rad: FloatArray, axes_rad: FloatArray) -> FloatArray:
-    """Largest difference of a motor's joint from its measured position in each sample, (k,)."""
-    difference = np.abs(found_rad - axes_rad)
-    return np.asarray(np.max(difference, axis=1))
-
-
 def reach_near(
     robot: Robot, assembly: Assembly, near_rad: FloatArray, axes_rad: FloatArray
-) -> Reach:
+) -> FloatArray:
     """Close the loops from poses near by, as those with slightly other lengths or zeros.
 
     Args:
@@ -433,11 +427,12 @@ def reach_near(
         assembly: of this robot, or of the other one: which joints follow is the same.
         near_rad: positions of all joints, shape (k, n).
         axes_rad: of the motors' joints, shape (k, m).
+
+    Returns:
+        positions of all joints, shape (k, n).
     """
-    motors = list(robot.axis_joints)
-    found, gap, condition = _newton(robot, assembly, near_rad, axes_rad)
-    misfit = _largest_misfit(found[:, motors], axes_rad)
-    return Reach(found, gap, misfit, condition)
+    position, _, _ = _newton(robot, assembly, near_rad, axes_rad)
+    return position
 
 
 def _newton(
@@ -563,8 +558,9 @@ def _closed_near(robot: Robot, start: FloatArray, size_m: float) -> FloatArray:
     residual = loops(robot, start[None], size_m).residual[0]
     if float(np.max(np.abs(residual))) < LARGEST_GAP:
         for moved in (passive, joints):
-            position = _closed_by(robot, start, size_m, moved)
-            if position is not None:
+            position, gap = towards_closed(robot, start, size_m, moved)
+            farthest = float(np.max(np.abs(position - start)))
+            if gap < CLOSED and farthest < np.pi:  # less than half a turn
                 return position
     closure, gaps = _worst_closure(robot, np.abs(residual))
     # A gap is a share of the robot's size where its direction is a length, else an angle.
@@ -576,11 +572,11 @@ def _closed_near(robot: Robot, start: FloatArray, size_m: float) -> FloatArray:
     )
 
 
-def _closed_by(
-    robot: Robot, start: FloatArray, size_m: float, moved: list[int]
-) -> FloatArray | None:
-    """Close the loops by moving some joints less than half a turn;
-    None where Newton's iteration does not.
+def towards_closed(
+    robot: Robot, start: FloatArray, size_m: float, moved: Sequence[int]
+) -> tuple[FloatArray, float]:
+    """Close the loops by moving some joints, as far as Newton's iteration does: the position, (n,),
+    and the gap that was left before the last step.
     """
     position = start.copy()
     for _ in range(MAX_ITERATIONS):
@@ -590,17 +586,10 @@ def _closed_by(
         if gap < CLOSED or not np.isfinite(gap):
             break
         jacobian = closing.jacobian[0][:, moved]
-        position[moved] -= _shortest_step(jacobian, residual)
-    farthest = float(np.max(np.abs(position - start)))
-    if gap < CLOSED and farthest < np.pi:
-        return position
-    return None
-
-
-def _shortest_step(jacobian: FloatArray, residual: FloatArray) -> FloatArray:
-    """The shortest x with J x = φ, or nearly so, shape (n,)."""
-    step, *_ = np.linalg.lstsq(jacobian, residual, rcond=1e-8)
-    return np.asarray(step)
+        # The shortest step that closes them, or nearly so
+        step, *_ = np.linalg.lstsq(jacobian, residual, rcond=1e-8)
+        position[moved] -= step
+    return position, gap
 
 
 def _worst_closure(robot: Robot, gaps: FloatArray) -> tuple[Closure, FloatArray]:
@@ -657,14 +646,13 @@ def _generic_rank(robot: Robot, position: FloatArray, free: FloatArray, size_m: 
     The rank is the largest of four poses at random: at a single one it may be singular again.
     """
     motors = list(robot.axis_joints)
+    joints = range(robot.joint_count)
     rng = np.random.default_rng(0)
     best = 0
     for _ in range(4):
         near = position + 0.02 * free @ rng.standard_normal(free.shape[1])
-        for _ in range(MAX_ITERATIONS):
-            closing = loops(robot, near[None], size_m)
-            near -= _shortest_step(closing.jacobian[0], closing.residual[0])
-        jacobian = loops(robot, near[None], size_m).jacobian[0]
+        closed, _ = towards_closed(robot, near, size_m, joints)
+        jacobian = loops(robot, closed[None], size_m).jacobian[0]
         driven = null_space(jacobian)[motors]
         rank = int(np.linalg.matrix_rank(driven, tol=1e-6))
         best = max(best, rank)

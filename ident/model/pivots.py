@@ -24,7 +24,7 @@ import numpy as np
 
 from ident.arrays import FloatArray
 from ident.errors import ModelError
-from ident.model.closed_chain import CLOSED, MAX_ITERATIONS, Assembly, assemble, null_space
+from ident.model.closed_chain import Assembly, assemble, null_space, towards_closed
 from ident.model.closures import joint_axes, loops, spin
 from ident.model.robot import Closure, JointKind, Motion, Pivot, Poses, Robot, joints_to_base, poses
 
@@ -223,14 +223,8 @@ def _speeds_near(robot: Robot, assembly: Assembly) -> FloatArray:
     speeds: list[FloatArray] = []
     for size in AWAY:
         drawn = draw.standard_normal(free.shape[1])
-        position = assembly.position_rad + size * free @ drawn
-        for _ in range(MAX_ITERATIONS):
-            closing = loops(robot, position[None], assembly.size_m)
-            residual = closing.residual[0]
-            if np.abs(residual).max() < CLOSED:
-                break
-            step, *_ = np.linalg.lstsq(closing.jacobian[0], residual, rcond=1e-8)
-            position = position - step
+        near = assembly.position_rad + size * free @ drawn
+        position, _ = towards_closed(robot, near, assembly.size_m, range(robot.joint_count))
         closing = loops(robot, position[None], assembly.size_m)
         of_joints = null_space(closing.jacobian[0])
         (rates,) = pivot_rates(robot, position[None])
