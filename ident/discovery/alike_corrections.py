@@ -17,7 +17,7 @@ from ident.discovery.candidates import SearchProblem
 from ident.discovery.search import Finding
 from ident.effects.effect import PlacedEffect
 from ident.effects.geometry_corrections import GravityDirection, LatePosition, ZeroOffset
-from ident.model.robot import JointKind, Robot, chain_of
+from ident.model.robot import JointKind, Robot, joints_to_base
 
 OWN_SHARE = 0.5  #: Of what a correction explains alone, that it must explain beside another effect
 WIDE_RAD = float(np.deg2rad(120.0))  #: Range of a joint that turns the arm behind it enough
@@ -96,7 +96,7 @@ def axes_before(axis: int, robot: Robot) -> tuple[int, ...]:
     """Axes whose joints are before that of an axis on its chain, the last one first."""
     before: list[int] = []
     own = robot.joints[robot.axis_joints[axis]]
-    for joint in chain_of(robot, own.parent):
+    for joint in joints_to_base(robot, own.parent):
         if joint in robot.axis_joints:
             before.append(robot.axis_joints.index(joint))
     return tuple(before)

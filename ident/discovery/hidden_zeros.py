@@ -8,7 +8,7 @@ import numpy as np
 
 from ident.arrays import FloatArray
 from ident.discovery.alike_corrections import axes_before
-from ident.model.robot import JointKind, Robot, chain_of
+from ident.model.robot import JointKind, Robot, joints_to_base
 
 UPRIGHT = 0.1
 """Largest sine of the angle between an axis and gravity, 6°, at which the axis counts as vertical:
@@ -63,6 +63,6 @@ def _is_upright(robot: Robot, axis: int) -> bool:
 def _direction(robot: Robot, number: int) -> FloatArray:
     """Direction of a joint's axis in the base frame at position zero, shape (3,)."""
     direction = robot.joints[number].axis
-    for joint in chain_of(robot, number):
+    for joint in joints_to_base(robot, number):
         direction = robot.joints[joint].rotation @ direction
     return np.asarray(direction)

@@ -562,7 +562,7 @@ def jackknife_covariance(
     if system.preload:
         grams, scores = _sums_with_preload(system, gains, parameters, noise)
     else:
-        grams, scores = _sums_of_motors(system, recorded, gains, parameters, noise)
+        grams, scores, _ = sums_of_motors(system, recorded, gains, parameters, noise)
     runs = np.array([run for run, _ in system.cluster_runs])
     free_grams = grams[:, free, free]
     free_scores = scores[:, free]
@@ -591,10 +591,10 @@ def _sums_with_preload(
     return grams, scores
 
 
-def _sums_of_motors(
+def sums_of_motors(
     system: System, recorded: System, gains: FloatArray, parameters: FloatArray, noise: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """JᵀJ and Jᵀe of each cluster, shapes (C, f, f) and (C, f).
+) -> tuple[FloatArray, FloatArray, float]:
+    """JᵀJ and Jᵀe of each cluster, shapes (C, f, f) and (C, f), and eᵀe of all.
 
     A motor is linearised on the rows of all clusters at once, and products are made of the unknowns
     that it has: near the flange these are less than half.
@@ -607,6 +607,7 @@ def _sums_of_motors(
     size = len(gains) + len(parameters)
     grams = np.zeros((len(system.clusters), size, size))
     scores = np.zeros((len(system.clusters), size))
+    left = 0.0
     for motor in range(len(gains)):
         of_clusters = [cluster[motor] for cluster in system.clusters]
         rows = np.concatenate(of_clusters)
@@ -615,6 +616,7 @@ def _sums_of_motors(
             of_recorded = [cluster[motor] for cluster in recorded.clusters]
             recorded_rows = np.concatenate(of_recorded)
             _, residual = motor_jacobian(recorded_rows, motor, gains, parameters, noise)
+        left += float(residual @ residual)
         seen = np.flatnonzero(jacobian.any(axis=0))
         seen_jacobian = jacobian[:, seen]
         ends = np.cumsum([len(of_cluster) for of_cluster in of_clusters])
@@ -627,7 +629,7 @@ def _sums_of_motors(
             scores[index, seen] += cluster_jacobian.T @ cluster_residual
             first = end
         grams[:, seen[:, None], seen] += seen_grams
-    return grams, scores
+    return grams, scores, left
 
 
 @dataclass(frozen=True, slots=True)

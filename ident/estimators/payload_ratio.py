@@ -13,7 +13,7 @@ It competes with the hypothesis that a single run carries another body than it s
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy  # loads its modules when they are first used: a clean fit needs none of them
@@ -23,8 +23,8 @@ from ident.equations.linearisation import (
     MIN_MOVES_TO_LEAVE_OUT,
     even_unit,
     left_out_shifts,
-    motor_jacobian,
     scatter_of,
+    sums_of_motors,
 )
 from ident.equations.system import System
 from ident.errors import Diagnosis
@@ -109,11 +109,15 @@ def _with_factor(
 ) -> MassContradiction | None:
     """Fit the factor of one body with all other unknowns; None where it is one."""
     noise = system.currents.noise(gains, parameters)
-    clusters = _extended(system, mountings)
+    extended = _extended(system, mountings)
     count = len(gains)
     values = np.concatenate((gains, parameters, [0.0]))
     before = 0.0
-    grams, scores, left = _normal_equations(clusters, count, values, noise)
+
+    def sums_at(values: FloatArray) -> tuple[FloatArray, FloatArray, float]:
+        return sums_of_motors(extended, extended, values[:count], values[count:], noise)
+
+    grams, scores, left = sums_at(values)
     for _ in range(STEPS):
         before = before or left
         step = _solved(grams.sum(axis=0), scores.sum(axis=0))
@@ -121,9 +125,7 @@ def _with_factor(
             trial = values + step
             keeps_signs = np.all(trial[:count] * values[:count] > 0.0)
             if keeps_signs:
-                trial_grams, trial_scores, trial_left = _normal_equations(
-                    clusters, count, trial, noise
-                )
+                trial_grams, trial_scores, trial_left = sums_at(trial)
                 if trial_left <= left:
                     break
             step = 0.5 * step
@@ -139,16 +141,16 @@ def _with_factor(
     shifts = left_out_shifts(grams, scores)
     covariance = scatter_of(shifts)
     std = float(np.sqrt(covariance[-1, -1]))
-    moves = len(clusters)
+    moves = len(system.clusters)
     probability = 2.0 * float(scipy.special.stdtr(moves - 1, -abs(factor) / std))
     if abs(factor) < LEAST_CHANGE or probability * (len(others) + 1) > LARGEST_PROBABILITY:
         return None
     return MassContradiction(body, others, 1.0 + factor, std, left / before)
 
 
-def _extended(system: System, mountings: Sequence[int]) -> list[list[FloatArray]]:
-    """Rows of each cluster and motor, with what is known of one body in the last column but one."""
-    clusters: list[list[FloatArray]] = []
+def _extended(system: System, mountings: Sequence[int]) -> System:
+    """The motors' rows, with what is known of one body in the last column but one."""
+    clusters: list[tuple[FloatArray, ...]] = []
     for (_, mounting), rows in zip(system.cluster_runs, system.clusters, strict=True):
         is_mounted = float(mounting in mountings)
         own: list[FloatArray] = []
@@ -157,25 +159,8 @@ def _extended(system: System, mountings: Sequence[int]) -> list[list[FloatArray]
             known = motor[:, -1:]
             of_body = is_mounted * known
             own.append(np.concatenate((unknown, of_body, known), axis=1))
-        clusters.append(own)
-    return clusters
-
-
-def _normal_equations(
-    clusters: Sequence[Sequence[FloatArray]], count: int, values: FloatArray, noise: FloatArray
-) -> tuple[FloatArray, FloatArray, float]:
-    """JᵀJ and Jᵀe of each cluster around some values, and the sum of squares of e."""
-    size = len(values)
-    grams = np.zeros((len(clusters), size, size))
-    scores = np.zeros((len(clusters), size))
-    left = 0.0
-    for index, rows in enumerate(clusters):
-        for motor, own in enumerate(rows):
-            jacobian, residual = motor_jacobian(own, motor, values[:count], values[count:], noise)
-            grams[index] += jacobian.T @ jacobian
-            scores[index] += jacobian.T @ residual
-            left += float(residual @ residual)
-    return grams, scores, left
+        clusters.append(tuple(own))
+    return replace(system, clusters=tuple(clusters))
 
 
 def _solved(gram: FloatArray, score: FloatArray) -> FloatArray:

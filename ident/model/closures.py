@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ident.arrays import FloatArray
-from ident.model.robot import Closure, JointKind, Place, Poses, Robot, chain_of, poses
+from ident.model.robot import Closure, JointKind, Place, Poses, Robot, joints_to_base, poses
 
 _AFTER = {"x": "y", "y": "z", "z": "x"}
 _INDEX = {"x": 0, "y": 1, "z": 2}
@@ -168,7 +168,7 @@ def _columns(
     linear = np.zeros_like(axes)
     angular = np.zeros_like(axes)
     revolute: list[int] = []
-    for joint in chain_of(robot, place.joint):
+    for joint in joints_to_base(robot, place.joint):
         if robot.joints[joint].kind is JointKind.REVOLUTE:
             revolute.append(joint)
         else:

@@ -26,7 +26,7 @@ from ident.model.bodies import LINK_PARAMETERS, LINK_UNITS, LOADED
 from ident.model.closed_chain import Assembly, TreeMotion, assemble, follow
 from ident.model.pivots import pivot_motion, pivot_rates
 from ident.model.regressor import fill_rigid, mass_matrix, rigid_torque
-from ident.model.robot import JointKind, Motion, Robot, at_rest, chain_of, require_described
+from ident.model.robot import JointKind, Motion, Robot, at_rest, joints_to_base, require_described
 
 DRIVE_UNITS = {
     JointKind.REVOLUTE: ("Nm", "rad/s", "kg m²"),
@@ -314,7 +314,7 @@ class Model:
             if self.robot.is_constrained:
                 out[:, own] = True
                 continue
-            for joint in chain_of(self.robot, link):  # that the link loads
+            for joint in joints_to_base(self.robot, link):  # that the link loads
                 out[joint, own] = True
         direction = self.drive_train.direction
         for motor, first in self._each_coupled():

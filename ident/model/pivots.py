@@ -26,7 +26,7 @@ from ident.arrays import FloatArray
 from ident.errors import ModelError
 from ident.model.closed_chain import Assembly, assemble, null_space, towards_closed
 from ident.model.closures import joint_axes, loops, spin
-from ident.model.robot import Closure, JointKind, Motion, Pivot, Poses, Robot, chain_of, poses
+from ident.model.robot import Closure, JointKind, Motion, Pivot, Poses, Robot, joints_to_base, poses
 
 #: Difference of two joints' speeds, relative to the largest, below which they turn alike
 ALIKE = 1e-7
@@ -187,7 +187,7 @@ def _loop(robot: Robot, closure: Closure) -> dict[int, float]:
     """
     signs: dict[int, float] = {}
     for place, sign in ((closure.second, 1.0), (closure.first, -1.0)):
-        for joint in chain_of(robot, place.joint):
+        for joint in joints_to_base(robot, place.joint):
             if robot.joints[joint].kind is JointKind.REVOLUTE:
                 signs[joint] = signs.get(joint, 0.0) + sign
     return {joint: sign for joint, sign in signs.items() if sign != 0.0}

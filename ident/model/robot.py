@@ -384,7 +384,7 @@ def poses(robot: Robot, position_rad: FloatArray) -> Poses:
     return Poses(rotation, origin)
 
 
-def chain_of(robot: Robot, joint: int) -> Iterator[int]:
+def joints_to_base(robot: Robot, joint: int) -> Iterator[int]:
     """A joint and those before it, to the base; none of the base itself, -1."""
     while joint >= 0:
         yield joint

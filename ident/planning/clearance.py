@@ -20,7 +20,7 @@ import numpy as np
 
 from ident.arrays import BoolArray, FloatArray
 from ident.model.closed_chain import assemble, reach
-from ident.model.robot import JointKind, Robot, chain_of, poses
+from ident.model.robot import JointKind, Robot, joints_to_base, poses
 
 _Point = tuple[float, float, float]
 BASE = -1  #: Index of the link that does not move
@@ -399,7 +399,7 @@ class Checker:
         """Joints from a body to the base; none of a box."""
         if body >= len(self.scene.capsules):
             return []
-        return list(chain_of(self.robot, self.scene.capsules[body].link))
+        return list(joints_to_base(self.robot, self.scene.capsules[body].link))
 
 
 def _pairs_with_boxes(scene: Scene) -> list[tuple[int, int]]:

@@ -16,12 +16,12 @@ from ident.equations.linearisation import (
     MIN_MOVES_TO_LEAVE_OUT,
     Jacobian,
     Linearisation,
-    _sums_of_motors,
     independent_blocks,
     jackknife_covariance,
     left_out_shifts,
     linearise,
     motor_jacobian,
+    sums_of_motors,
 )
 from ident.errors import TooFewMoves
 from ident.estimators.estimate import Identification
@@ -190,8 +190,9 @@ def test_sums_of_clusters_are_those_of_each_clusters_own_rows(
         system = replace(recorded, clusters=tuple(tilted))
     estimate = noisy.estimate
     around = (estimate.gains, estimate.parameters, estimate.axis_noise)
-    grams, scores = _sums_of_motors(system, recorded, *around)
+    grams, scores, left = sums_of_motors(system, recorded, *around)
     size = grams.shape[-1]
+    squares = 0.0
     for index, cluster in enumerate(system.clusters):
         gram = np.zeros((size, size))
         score = np.zeros(size)
@@ -201,10 +202,12 @@ def test_sums_of_clusters_are_those_of_each_clusters_own_rows(
             _, residual = motor_jacobian(own_rows, motor, *around)
             gram += jacobian.T @ jacobian
             score += jacobian.T @ residual
+            squares += residual @ residual
         largest_product = np.abs(gram).max()
         largest_score = np.abs(score).max()
         assert grams[index] == pytest.approx(gram, rel=1e-9, abs=1e-9 * largest_product)
         assert scores[index] == pytest.approx(score, rel=1e-9, abs=1e-9 * largest_score)
+    assert left == pytest.approx(squares, rel=1e-9)
 
 
 def _slow_line(
