@@ -202,7 +202,7 @@ def test_sums_of_clusters_are_those_of_each_clusters_own_rows(
             _, residual = motor_jacobian(own_rows, motor, *around)
             gram += jacobian.T @ jacobian
             score += jacobian.T @ residual
-            squares += residual @ residual
+            squares += float(residual @ residual)
         largest_product = np.abs(gram).max()
         largest_score = np.abs(score).max()
         assert grams[index] == pytest.approx(gram, rel=1e-9, abs=1e-9 * largest_product)
