@@ -15,7 +15,7 @@ from tempfile import TemporaryDirectory
 
 import zstandard
 
-from daq.errors import LogCorrupt, LogMissing, LogTruncated, OutputFailed, reason_of
+from daq.errors import LogCorrupt, LogMissing, LogTruncated, OutputFailed, counted, reason_of
 from daq.files import open_regular
 from daq.log.container import LARGEST_CHUNK, LARGEST_RATIO, LARGEST_RECORD
 from daq.log.mcap_bag import ZSTD_MAGIC, BagMessage, McapBag, Topic
@@ -59,6 +59,7 @@ class SqliteBag:
                 (found,) = database.execute("PRAGMA quick_check(1)").fetchone()
                 if found != "ok":
                     raise self._broken(str(self.path), str(found))
+                self._refuse_another_behind(database)
                 yield from self._messages(database)
         except OSError as error:
             raise LogMissing(
@@ -85,6 +86,26 @@ class SqliteBag:
         database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, LARGEST_RECORD)
         database.set_progress_handler(self._count_steps, COUNTED_STEPS)
         database.execute("PRAGMA trusted_schema = OFF")
+
+    def _refuse_another_behind(self, database: sqlite3.Connection) -> None:
+        """Refuse a second database behind the pages of the first, which SQLite does not look at."""
+        (pages,) = database.execute("PRAGMA page_count").fetchone()
+        (page_bytes,) = database.execute("PRAGMA page_size").fetchone()
+        end = pages * page_bytes
+        with open_regular(self._source) as stream:
+            size = os.fstat(stream.fileno()).st_size
+            stream.seek(end)
+            is_another = stream.read(len(SQLITE_MAGIC)) == SQLITE_MAGIC
+        if not is_another:
+            return
+        behind = counted(size - end, "byte")
+        raise LogCorrupt(
+            str(self.path),
+            found=f"{behind} behind its end, which begin as another bag does",
+            expected="one bag",
+            remedy="files joined by `cat` are no bag: give each recording by itself; the first one "
+            f"alone is `head -c {end}` of the file",
+        )
 
     def _count_steps(self) -> bool:
         """Count; SQLite stops at True."""

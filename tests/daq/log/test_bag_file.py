@@ -94,6 +94,16 @@ def test_a_file_that_a_player_has_unpacked_is_read_once(tmp_path: Path) -> None:
     assert_whole(read(folder))
 
 
+def test_two_databases_in_one_file_are_refused(tmp_path: Path) -> None:
+    """SQLite reads the first one, and does not look behind it."""
+    folder = record(tmp_path / "bag", StoragePlugin.SQLITE3, CompressionMode.NONE)
+    file = folder / "bag.db3"
+    content = file.read_bytes()
+    file.write_bytes(content + content)
+    with pytest.raises(LogCorrupt, match=f"{len(content)} bytes behind its end, .* another bag"):
+        read(file)
+
+
 @pytest.fixture(scope="module")
 def database(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A short bag in SQLite."""
