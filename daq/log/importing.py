@@ -337,8 +337,8 @@ def _judged_recording(
     file_position = section_values(wanted.position, tables)
     current = section_values(wanted.current, tables)
     require_changing(file_position, current, wanted, tables)
-    require_own_columns(wanted.position, file_position, tables)
-    require_own_columns(wanted.current, current, tables)
+    both = np.hstack((file_position, current))
+    require_own_columns((wanted.position, wanted.current), both, tables)
     remarks: tuple[str, ...] = ()
     if wanted.position.unit is PositionUnit.COUNTS:
         file_position, remarks = signed_counts(file_position, wanted)

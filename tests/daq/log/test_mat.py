@@ -20,6 +20,7 @@ from scipy.io import savemat
 from daq.config.import_description import ImportDescription, KeptPart, TimeColumn, TimeUnit
 from daq.errors import TableUnfit
 from daq.log.conversion import load_run
+from daq.log.importing import import_recording
 from daq.log.mat_table import read_mat
 from daq.log.table import Table
 from tests.daq.command_line import run_verb
@@ -328,6 +329,29 @@ def test_a_matrix_is_imported_with_its_columns_as_axes(checkout: Path, tmp_path:
     position_rad = np.radians(Q)
     np.testing.assert_allclose(run.position_rad, position_rad, atol=2e-9)
     np.testing.assert_allclose(run.current_a, CURRENT, atol=1e-9)
+
+
+def test_a_variable_that_is_a_copy_of_the_positions_is_no_current(
+    checkout: Path, tmp_path: Path
+) -> None:
+    savemat(tmp_path / "run.mat", {"q": Q, "i": Q})
+    description = tmp_path / "run.yaml"
+    position = {"file": "run.mat", "columns": ["q"], "unit": "deg", "side": "joint"}
+    current = {"file": "run.mat", "columns": ["i"], "unit": "A"}
+    document = {
+        "name": "run",
+        "cell": str(checkout / "configs/cells/demo.yaml"),
+        "position": position,
+        "current": current,
+        "rate_hz": 1000.0,
+    }
+    description.write_text(json.dumps(document))
+    with pytest.raises(
+        TableUnfit,
+        match=r"column i\.1: found the same number as column q\.1 of run\.mat in all 300 rows; "
+        "expected a column of its own for each quantity",
+    ):
+        import_recording(description, tmp_path, tmp_path / "log.mcap", software="test")
 
 
 def test_stamps_and_numbers_of_columns_without_end_are_refused(tmp_path: Path) -> None:
