@@ -57,6 +57,10 @@ LARGEST_DISTANCE_M = 50.0  #: Between joints that follow each other: more than a
 LEAST_MASS = 1e-9
 LARGEST_MASS = 1e9
 LARGEST_INERTIA = 1e15
+#: Of a joint that follows another one: a rack has 1e3 rad/m, a fine screw 1e-5 m/rad
+LEAST_MULTIPLIER = 1e-9
+LARGEST_MULTIPLIER = 1e6
+LARGEST_OFFSET = 1e6  #: [rad or m]; likewise
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -270,7 +274,8 @@ def mimics_of(urdf: str) -> dict[str, Mimic]:
     """Return the joints of a URDF that move and mimic another one, by name.
 
     Raises:
-        ModelError: the text is no URDF, or a multiplier or an offset is no number.
+        ModelError: the text is no URDF, or a multiplier or an offset is no number, or one that no
+            mechanism has.
     """
     robot = _root(urdf)
     return _mimics(_movable(robot))
@@ -293,7 +298,8 @@ def first_leader(name: str, mimics: Mapping[str, Mimic]) -> Mimic:
         mimics: of the URDF (`mimics_of`).
 
     Raises:
-        ModelError: the chain leads back to one of its joints.
+        ModelError: the chain leads back to one of its joints, or multiplies to a number that no
+            mechanism has.
     """
     seen = {name}
     found = mimics[name]
@@ -309,6 +315,7 @@ def first_leader(name: str, mimics: Mapping[str, Mimic]) -> Mimic:
         multiplier = found.multiplier * before.multiplier
         offset = found.multiplier * before.offset + found.offset
         found = Mimic(leader=before.leader, multiplier=multiplier, offset=offset)
+        _require_mechanism(name, found)
     return found
 
 
@@ -347,8 +354,26 @@ def _mimics(movable: Mapping[str, Element]) -> dict[str, Mimic]:
             raise ModelError(
                 f"<mimic> of {name!r} in the URDF has a multiplier or offset that is no number"
             )
-        found[name] = Mimic(mimic.get("joint", ""), multiplier, offset)
+        follows = Mimic(mimic.get("joint", ""), multiplier, offset)
+        _require_mechanism(name, follows)
+        found[name] = follows
     return found
+
+
+def _require_mechanism(name: str, mimic: Mimic) -> None:
+    """Refuse a follower that no mechanism moves so: positions and torques of it would overflow."""
+    size = abs(mimic.multiplier)
+    if not mimic.at_rest and not LEAST_MULTIPLIER <= size <= LARGEST_MULTIPLIER:
+        raise ModelError(
+            f"joint {name!r} mimics joint {mimic.leader!r} with the multiplier "
+            f"{mimic.multiplier:g}; expected a size of {LEAST_MULTIPLIER:g} to "
+            f"{LARGEST_MULTIPLIER:g}: correct <mimic> of {name!r}"
+        )
+    if abs(mimic.offset) > LARGEST_OFFSET:
+        raise ModelError(
+            f"joint {name!r} mimics joint {mimic.leader!r} with the offset {mimic.offset:g}; "
+            f"expected at most {LARGEST_OFFSET:g} rad or m: correct <mimic> of {name!r}"
+        )
 
 
 def _followed(mimics: Mapping[str, Mimic], position_rad: Mapping[str, float]) -> dict[str, float]:
@@ -818,7 +843,13 @@ def _vector(element: Element, key: str, name: str) -> FloatArray:
         raise ModelError(
             f"<{element.tag}> of {name!r} in the URDF has {key}={text!r}; expected three numbers"
         )
-    return np.array(numbers, dtype=np.float64)
+    vector = np.array(numbers, dtype=np.float64)
+    if np.max(np.abs(vector)) > LARGEST_NUMBER:
+        raise ModelError(
+            f"<{element.tag}> of {name!r} in the URDF has {key}={text!r}; expected at most "
+            f"{LARGEST_NUMBER:g} in each of three numbers"
+        )
+    return vector
 
 
 def _number(element: Element, key: str, name: str) -> float:
