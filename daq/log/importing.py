@@ -34,7 +34,7 @@ from daq.config.import_description import (
     VelocityUnit,
     load_import,
 )
-from daq.errors import ConfigurationInconsistent, TableUnfit, UsageError
+from daq.errors import ConfigurationInconsistent, TableUnfit, UsageError, counted
 from daq.files import sha256
 from daq.log.bag_file import SQLITE_MAGIC, first_bytes
 from daq.log.bag_table import FIELDS, read_bag
@@ -470,9 +470,10 @@ def _read_tables(wanted: ImportDescription, data: Path) -> dict[str, Table]:
             tables[name] = replace(table, remarks=remarks)
     position = tables[wanted.position.files[0]]
     if len(position.values) < FEWEST_ROWS:
+        rows = counted(len(position.values), "row")
         raise TableUnfit(
             str(position.path),
-            found=f"{len(position.values)} rows of numbers",
+            found=f"{rows} of numbers",
             expected="a row for each sample of a motion",
             remedy="was the export interrupted? export the recording again",
         )
@@ -485,7 +486,10 @@ def _require_equal_rows(tables: Mapping[str, Table]) -> None:
     if len(counts) <= 1:
         return
     paths = [str(table.path) for table in tables.values()]
-    row_counts = [f"{len(table.values)} rows in {name}" for name, table in tables.items()]
+    row_counts: list[str] = []
+    for name, table in tables.items():
+        rows = counted(len(table.values), "row")
+        row_counts.append(f"{rows} in {name}")
     raise TableUnfit(
         ", ".join(paths),
         found=" and ".join(row_counts),
@@ -669,7 +673,7 @@ def _check_cell(wanted: ImportDescription, cell: Cell, description: Path) -> Non
     _check_columns(wanted, description)
     for key, section in wanted.sections():
         if len(section.places) != axis_count:
-            found = f"{len(section.places)} columns"
+            found = counted(len(section.places), "column")
             expected = f"{axis_count}, one for each axis of cell {cell.name!r}"
             raise ConfigurationInconsistent(
                 f"{description}: {key}.columns",

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daq.config.import_description import Column, ImportDescription, TimeColumn, TimeUnit
-from daq.errors import TableUnfit, first_few
+from daq.errors import TableUnfit, counted, first_few, printable
 from daq.files import read_regular
 from daq.log.table import (
     MIDNIGHT,
@@ -98,9 +98,10 @@ def read_mat(
     found = [file.column(name) for name in names]
     lengths = [len(numbers) for numbers in found]
     if len(set(lengths)) > 1:
-        described = [
-            f"{length} values in {name}" for name, length in zip(names, lengths, strict=True)
-        ]
+        described: list[str] = []
+        for name, length in zip(names, lengths, strict=True):
+            values_there = counted(length, "value")
+            described.append(f"{values_there} in {name}")
         raise TableUnfit(
             str(path),
             found=", ".join(described),
@@ -253,7 +254,8 @@ class _MatFile:
                 known = f"{name}.1"
             else:
                 known = f"{name}.1 to {name}.{width}"
-            raise self._unfit(f"column {column}, and {name} has {width} columns", f"one of {known}")
+            columns = counted(width, "column")
+            raise self._unfit(f"column {column}, and {name} has {columns}", f"one of {known}")
         return values[:, number - 1]
 
     def _numbers(self, name: str, parts: list[str]) -> NDArray[Any]:
@@ -384,5 +386,5 @@ def _text(data: memoryview) -> str:
 
 def _listed(arrays: dict[str, _Array], before: str = "") -> str:
     """Name up to twelve arrays with their sizes."""
-    names = [f"{before}{name} ({array})" for name, array in arrays.items()]
+    names = [f"{before}{printable(name)} ({array})" for name, array in arrays.items()]
     return first_few(names, 12, separator=", ") or "none"

@@ -29,8 +29,16 @@ from daq.config.import_description import (
     Side,
     TimeColumn,
     TimeUnit,
+    load_import,
 )
-from daq.errors import ConfigurationInconsistent, DataError, LogForeign, LogTruncated, TableUnfit
+from daq.errors import (
+    ConfigurationInconsistent,
+    DataError,
+    LogForeign,
+    LogTruncated,
+    SchemaMismatch,
+    TableUnfit,
+)
 from daq.log.bag_table import STAMP, interleaved, read_bag
 from daq.log.conversion import load_run
 from daq.log.importing import import_recording
@@ -714,9 +722,41 @@ def test_a_topic_is_chosen(tmp_path: Path) -> None:
         read(bag)
     assert_whole(read(bag, topic="/joint_states"))
     with pytest.raises(
-        TableUnfit, match="found topics /desired, /joint_states; expected /arm of type sensor_msgs"
+        TableUnfit,
+        match=r"found topics /desired, /joint_states; expected /arm of type sensor_msgs.*; correct "
+        r"`topic` .*; joint states are on /desired, /joint_states$",
     ):
         read(bag, topic="/arm")
+
+
+@pytest.mark.parametrize("section", [None, "position", "current"])
+def test_an_empty_topic_is_refused_in_the_description(
+    section: str | None, checkout: Path, tmp_path: Path
+) -> None:
+    document = _document(checkout)
+    keys = document
+    if section is not None:
+        keys = document[section]
+    keys["topic"] = ""
+    description = _write_description(tmp_path, document)
+    with pytest.raises(SchemaMismatch, match="topic"):
+        load_import(description)
+
+
+def test_stamps_alone_from_a_bag_are_refused(tmp_path: Path) -> None:
+    bag = write_bag(tmp_path / "run.mcap", recording())
+    with pytest.raises(TableUnfit, match=r"found the time column alone; .*correct `time`"):
+        read(bag, ())
+
+
+def test_names_with_line_ends_are_escaped_in_a_message(tmp_path: Path) -> None:
+    names = ["J1\nfound", "J2\r\n", "J3", "J4", "J5", "J6"]
+    messages = joint_states([message(0, name=names)])
+    bag = write_bag(tmp_path / "run.mcap", messages)
+    with pytest.raises(TableUnfit) as caught:
+        read(bag, ("position.J3", "position.J7"))
+    assert str(caught.value).isprintable()
+    assert r"'J1\nfound'" in caught.value.found
 
 
 @pytest.mark.parametrize(

@@ -124,7 +124,7 @@ def test_any_matrix_comes_back(
         (("q",), r"column q, and q has 6 columns; expected one of q.1 to q.6"),
         (("q.7",), "column q.7"),
         (("q.0",), "column q.0"),
-        (("t.2",), "t has 1 columns; expected one of t.1"),
+        (("t.2",), "t has 1 column; expected one of t.1"),
         (("q.q",), "q.q, where q is 300×6; expected VARIABLE, or STRUCT.FIELD"),
         (("run",), "run, where run is 1×1 struct"),
         (("run.i",), r"no field 'run.i'; expected one of run.q \(300×6\)"),
