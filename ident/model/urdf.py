@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from math import atan2, cos, inf, isfinite, sin, sqrt
+from math import atan2, cos, inf, isfinite, nan, sin, sqrt
 from os import PathLike
 from xml.etree.ElementTree import Element, ParseError, fromstring, tostring
 
@@ -659,8 +659,8 @@ def _joint(element: Element, at: Place) -> Joint:
     lowest: float | None = None
     travel: float | None = None
     limits = _position_limits(element)
-    if limits is not None:
-        lowest, highest = limits
+    if limits is not None and limits.range is not None:
+        lowest, highest = limits.range
         travel = highest - lowest
     return Joint(
         name=name,
@@ -674,20 +674,60 @@ def _joint(element: Element, at: Place) -> Joint:
     )
 
 
-def _position_limits(element: Element) -> tuple[float, float] | None:
-    """Lowest and highest position of a joint [rad or m]; None where its limits say nothing."""
+@dataclass(frozen=True, slots=True)
+class PositionLimits:
+    """Limits of a joint as its URDF writes them; a bound that is left out is 0, as URDF says."""
+
+    lower: str
+    upper: str
+
+    @property
+    def range(self) -> tuple[float, float] | None:
+        """Lowest and highest position [rad or m]; None where the limits say nothing."""
+        lower, upper = self._numbers()
+        # Some exporters write the largest float where a joint has no limit.
+        if 0.0 < upper - lower <= LARGEST_NUMBER:
+            return lower, upper
+        return None
+
+    @property
+    def are_contradictory(self) -> bool:
+        """Whether a bound is no number, or the upper one is below the lower one."""
+        lower, upper = self._numbers()
+        return not lower <= upper
+
+    def _numbers(self) -> tuple[float, float]:
+        try:
+            return float(self.lower), float(self.upper)
+        except ValueError:
+            return nan, nan
+
+    def __str__(self) -> str:
+        return f"lower={self.lower!r} and upper={self.upper!r}"
+
+
+def position_limits_of(urdf: str) -> dict[str, PositionLimits]:
+    """Return the limits of the movable joints of a URDF that have some, by name.
+
+    Raises:
+        ModelError: the text is no URDF.
+    """
+    found: dict[str, PositionLimits] = {}
+    for name, joint in _movable(_root(urdf)).items():
+        limits = _position_limits(joint)
+        if limits is not None:
+            found[name] = limits
+    return found
+
+
+def _position_limits(element: Element) -> PositionLimits | None:
+    """Limits of a joint; None for one that has none."""
     limit = element.find("limit")
     if limit is None or element.get("type") == "continuous":
         return None
-    try:
-        upper = float(limit.get("upper", ""))
-        lower = float(limit.get("lower", ""))
-    except ValueError:
-        return None
-    # Some exporters write the largest float where a joint has no limit.
-    if 0.0 < upper - lower <= LARGEST_NUMBER:
-        return lower, upper
-    return None
+    lower = limit.get("lower", "0")
+    upper = limit.get("upper", "0")
+    return PositionLimits(lower, upper)
 
 
 def _effort_limit(element: Element) -> float:
