@@ -15,12 +15,22 @@ from tempfile import TemporaryDirectory
 
 import zstandard
 
-from daq.errors import LogCorrupt, LogMissing, LogTruncated, OutputFailed, counted, reason_of
+from daq.config.yaml_file import MAGIC_OF_LOGS
+from daq.errors import (
+    LogCorrupt,
+    LogForeign,
+    LogMissing,
+    LogTruncated,
+    OutputFailed,
+    counted,
+    reason_of,
+)
 from daq.files import open_regular
-from daq.log.container import LARGEST_CHUNK, LARGEST_RATIO, LARGEST_RECORD
+from daq.log.container import LARGEST_CHUNK, LARGEST_RATIO, LARGEST_RECORD, MAGIC
 from daq.log.mcap_bag import ZSTD_MAGIC, BagMessage, McapBag, Topic
 from daq.log.message import JOINTS_SCHEMA
 from daq.log.ros1_bag import ROS_1_MAGIC, Ros1Bag
+from daq.log.table import kind_of_content
 
 SQLITE_MAGIC = b"SQLite format 3\0"
 #: Instructions of SQLite for any file, and STEPS_A_BYTE more for each byte; a message takes 20
@@ -197,7 +207,40 @@ def _bag(path: Path, source: Path) -> McapBag | SqliteBag | Ros1Bag:
         return SqliteBag(path, source)
     if head.startswith(ROS_1_MAGIC):
         return Ros1Bag(path, source)
+    if not head.startswith(MAGIC_OF_LOGS):
+        _refuse_other_kind(path, source, head)
     return McapBag(path, source)
+
+
+def _refuse_other_kind(path: Path, source: Path, head: bytes) -> None:
+    """Refuse a file without the first bytes of a bag.
+
+    Raises:
+        LogMissing: it cannot be opened.
+        LogTruncated: it ends within these bytes.
+        LogForeign: it is of another kind.
+    """
+    expected = "a ROS bag: MCAP or SQLite of ROS 2, or one of ROS 1"
+    try:
+        with open_regular(source):
+            pass
+    except OSError as error:
+        raise LogMissing(
+            str(path),
+            found=reason_of(error),
+            expected=expected,
+            remedy="check --data and the file name in the import description",
+        ) from error
+    if any(magic.startswith(head) for magic in (MAGIC, SQLITE_MAGIC, ROS_1_MAGIC)):
+        size = counted(len(head), "byte")
+        raise LogTruncated(
+            str(path),
+            found=f"{size} with which a bag begins",
+            expected="a recording",
+            remedy="copy it again from where it was recorded, or record again",
+        )
+    found, remedy = kind_of_content(head)
+    raise LogForeign(str(path), found=found, expected=expected, remedy=remedy)
 
 
 def first_bytes(path: Path) -> bytes:

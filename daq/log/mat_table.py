@@ -33,6 +33,7 @@ from daq.log.table import (
     counter_wraps,
     cut_stamps,
     digest_of,
+    kind_of_content,
     repeated,
     require_finite,
     require_kept,
@@ -49,6 +50,7 @@ LARGEST_BYTES = 2**31 - 1  #: Largest file and variable; the format has no large
 LARGEST_RATIO = 200
 SMALL_BYTES = 64 * 2**20
 _HEADER_BYTES = 128
+_SHOWN_BYTES = 20  #: Of a file of another kind, in a message
 _PEEK_BYTES = 4096  #: Class, dimensions and name of a variable are in its first bytes
 
 # Types of elements and classes of arrays, by their numbers in the format.
@@ -165,17 +167,35 @@ def _content(path: Path) -> memoryview:
     except OSError as error:
         raise unreadable(path, error, "a MATLAB file (.mat) of at most 2 GB") from error
     byte_order = content[126:128]
-    if content.startswith(MAGIC) and byte_order in (b"IM", b"MI"):
+    has_magic = content.startswith(MAGIC)
+    if has_magic and byte_order in (b"IM", b"MI"):
         return memoryview(content)
+    is_begin = 0 < len(content) < _HEADER_BYTES and content.startswith(MAGIC[: len(content)])
+    if is_begin:
+        size = counted(len(content), "byte")
+        raise _damaged(path, f"{size} of a header of {_HEADER_BYTES}")
+    if has_magic:
+        raise _damaged(path, "no mark of the order of bytes in its header")
     if b"\x89HDF\r\n" in content[: 512 + 8]:
         found = "a MATLAB file of format 7.3 (HDF5)"
+        remedy = "in MATLAB: save('run.mat', 'q', 'i', 't', '-v7') with the names of your variables"
     else:
-        found = f"first bytes {content[:20]!r}"
+        found, remedy = kind_of_content(content[:_SHOWN_BYTES])
     raise TableUnfit(
         str(path),
         found=found,
         expected="a MATLAB file of format 5, as `save -v7` writes it",
-        remedy="in MATLAB: save('run.mat', 'q', 'i', 't', '-v7') with the names of your variables",
+        remedy=remedy,
+    )
+
+
+def _damaged(path: Path, found: str) -> TableUnfit:
+    """Make the error for a file that is none to its end."""
+    return TableUnfit(
+        str(path),
+        found=f"a damaged MATLAB file ({found})",
+        expected="whole variables",
+        remedy="the file ends early or was changed: save or copy it again",
     )
 
 
@@ -211,6 +231,8 @@ class _MatFile:
             self._variables = dict(self._found(content[_HEADER_BYTES:]))
         except (ValueError, struct.error, zlib.error) as error:
             raise self._broken(error) from error
+        if not self._variables:
+            raise _damaged(path, "its header alone, without a variable")
 
     def _found(self, data: memoryview) -> Iterator[tuple[str, tuple[_Array, memoryview | None]]]:
         """Name, array and packed bytes of each variable;
@@ -264,13 +286,16 @@ class _MatFile:
         if array.kind not in (*_FLOATS, *_INTEGERS) or array.imaginary:
             raise self._unfit(f"{name}, {array}", "real numbers")
         sides = [side for side in array.shape if side != 1]
-        if not sides or len(sides) > 2 or 0 in sides:
+        if not sides or len(sides) > 2 or min(sides) < 1:
             raise self._unfit(
                 f"{name} of size {array}", "a column for each axis, a row for each sample"
             )
         kind, data, _ = self._element(array.body, 0)
         element_type = _TYPES.get(kind, "V1")
-        values = np.frombuffer(data, dtype=self._order + element_type)
+        dtype = np.dtype(self._order + element_type)
+        if len(data) % dtype.itemsize:
+            raise ValueError(f"{len(data)} bytes of numbers of {dtype.itemsize} bytes each")
+        values = np.frombuffer(data, dtype=dtype)
         if values.dtype.kind == "V" or len(values) != prod(sides):
             raise ValueError(f"{len(values)} numbers for {array}")
         table = values.reshape(sides[0], -1, order="F")
@@ -372,12 +397,10 @@ class _MatFile:
         return TableUnfit(str(self._path), found=found, expected=expected, remedy=remedy)
 
     def _broken(self, error: Exception) -> TableUnfit:
-        return TableUnfit(
-            str(self._path),
-            found=f"a damaged MATLAB file ({error})",
-            expected="whole variables",
-            remedy="the file ends early or was changed: save or copy it again",
-        )
+        if type(error) is ValueError:
+            return _damaged(self._path, str(error))
+        # Of other errors the text is about buffers and streams of Python.
+        return _damaged(self._path, "bytes that are no variable")
 
 
 def _text(data: memoryview) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import json
 import pickle
 import random
@@ -175,10 +176,23 @@ def test_what_is_no_column_of_numbers_is_named(
         ),
         (
             pickle.dumps({"q": [1, 2]}),
-            "first bytes .*; expected a MATLAB file of format 5, as `save -v7` writes it",
+            "a file of an unknown kind; expected a MATLAB file of format 5, as `save -v7` writes "
+            "it; correct `file`",
         ),
-        (b"", "first bytes b''"),
-        (b"MATLAB 5.0 MAT-file".ljust(126) + b"IM", "no variable 'q'; expected one of none"),
+        (b"", "found an empty file; expected a MATLAB file"),
+        (gzip.compress(b"x"), r"found a file packed by gzip; .*gunzip"),
+        (b"PK\x03\x04" + bytes(60), "found a ZIP archive"),
+        (b"t,q1,q2\n0,1,2\n", r"a text file that begins with 't,q1,q2'; .*ends in \.csv"),
+        (b"MATLAB 5.0", r"damaged MATLAB file \(10 bytes of a header of 128\); .*copy it again"),
+        (b"MATLAB 5.0 MAT-file".ljust(128), "no mark of the order of bytes"),
+        (
+            b"MATLAB 5.0 MAT-file".ljust(126) + b"IM",
+            r"damaged MATLAB file \(its header alone, without a variable\)",
+        ),
+        (
+            b"MATLAB 5.0 MAT-file".ljust(126) + b"IM" + bytes(5),
+            r"damaged MATLAB file \(bytes that are no variable\)",
+        ),
     ],
 )
 def test_files_of_other_formats_are_refused(content: bytes, message: str, tmp_path: Path) -> None:
