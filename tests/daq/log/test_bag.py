@@ -33,6 +33,7 @@ from daq.config.import_description import (
 )
 from daq.errors import (
     ConfigurationInconsistent,
+    DaqError,
     DataError,
     LogForeign,
     LogTruncated,
@@ -845,6 +846,29 @@ def test_a_bag_is_imported_with_its_joints_as_axes(checkout: Path, tmp_path: Pat
     refused = tmp_path / "x.mcap"
     code = run_verb("import", description, "--data", tmp_path, "--out", refused)
     assert code == 4
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (None, r"nowhere: found no such file .*; expected a CSV or MATLAB file, or a ROS bag"),
+        (b"PAR1" + bytes(20), "nowhere: found a Parquet file; expected a CSV or MATLAB file, or"),
+        (b"J1,J2\n1,2\n", "which is also position.columns.*nowhere is to be a bag.*is no bag"),
+    ],
+    ids=["missing", "parquet", "text"],
+)
+def test_the_same_joints_of_a_file_that_is_no_bag_are_answered_by_the_file(
+    content: bytes | None, message: str, checkout: Path, tmp_path: Path
+) -> None:
+    document = _document(checkout)
+    for key in ("position", "current"):
+        document[key] |= {"file": "nowhere", "columns": list(JOINTS)}
+    document["time"]["file"] = "nowhere"
+    if content is not None:
+        (tmp_path / "nowhere").write_bytes(content)
+    description = _write_description(tmp_path, document)
+    with pytest.raises(DaqError, match=message):
+        import_recording(description, tmp_path, tmp_path / "log.mcap", software="test")
 
 
 @pytest.mark.parametrize("columns", [list(JOINTS), ["effort"], list(POSITION_COLUMNS)])
