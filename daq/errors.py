@@ -93,6 +93,15 @@ def counted(count: int, noun: str) -> str:
     return f"{count} {noun}s"
 
 
+def printable(text: str) -> str:
+    """Return a text of a file for one line of a message: with its control characters and line ends
+    escaped.
+    """
+    if text.isprintable():
+        return text
+    return ascii(text)
+
+
 def first_few(texts: Sequence[str], count: int, *, separator: str = "; ", note: str = "") -> str:
     """Join the first of some texts, and say how many more there are: ``a; b; and 3 more``.
 

@@ -44,7 +44,7 @@ from ident.data.conditioning import Conditioning
 from ident.errors import ModelError
 from ident.model.bodies import LINK_PARAMETERS
 from ident.model.robot import Place
-from ident.model.urdf import hold_joints, read_urdf
+from ident.model.urdf import PositionLimits, hold_joints, position_limits_of, read_urdf
 
 CELL = "cell.yaml"
 URDF = "robot.urdf"
@@ -167,7 +167,8 @@ def held_urdf(document: Document, model: CellModel, urdf: str) -> str:
         joints = {joint.get("name", ""): joint for joint in robot.findall("{*}joint")}
         held = _held_positions(model, joints)
         fixed = hold_joints(urdf, held)
-        faults = [*_hold_faults(model, held, joints)]
+        limits = position_limits_of(urdf)
+        faults = [*_hold_faults(model, held, joints, limits)]
     except ElementTree.ParseError:
         return urdf  # the check of the robot says so
     except ModelError as error:
@@ -192,7 +193,10 @@ def _held_positions(model: CellModel, joints: dict[str, ElementTree.Element]) ->
 
 
 def _hold_faults(
-    model: CellModel, held: dict[str, float], joints: dict[str, ElementTree.Element]
+    model: CellModel,
+    held: dict[str, float],
+    joints: dict[str, ElementTree.Element],
+    limits_by_joint: Mapping[str, PositionLimits],
 ) -> Iterator[Fault]:
     """Find held joints that are axes, and positions that the URDF excludes."""
     for name, position in held.items():
@@ -202,27 +206,23 @@ def _hold_faults(
                 "a joint that is also one of `axes`",
                 "an axis or a held joint, not both",
             )
-        limit = joints[name].find("{*}limit")
-        kind = joints[name].get("type")
-        if limit is None or kind == "continuous":
-            continue
-        try:
-            lower = float(limit.get("lower", "0"))
-            upper = float(limit.get("upper", "0"))
-        except ValueError:
+        limits = limits_by_joint.get(name)
+        if limits is None or limits.range is None:
             continue  # a held joint's limits are needed for this check alone
+        lower, upper = limits.range
         margin = 0.01 * (upper - lower)
         is_inside = lower - margin <= position <= upper + margin
-        if lower < upper and not is_inside:
+        if not is_inside:
+            kind = joints[name].get("type")
             if kind == "prismatic":
                 in_si = 1.0
                 unit = "m"
             else:
                 in_si = radians(1.0)
                 unit = "deg"
-            limits = f"{lower / in_si:.4g} to {upper / in_si:.4g} {unit}"
+            allowed = f"{lower / in_si:.4g} to {upper / in_si:.4g} {unit}"
             found = f"{model.hold[name]:g} {unit}"
-            yield Fault(("hold", name), found, f"{limits}, the limits in the URDF")
+            yield Fault(("hold", name), found, f"{allowed}, the limits in the URDF")
 
 
 def digest(files: Mapping[str, bytes]) -> str:

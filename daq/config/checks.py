@@ -30,7 +30,7 @@ from daq.errors import ConfigurationInconsistent
 from drivers.profiles.profile import DriveProfile
 from ident.errors import ModelError
 from ident.model.robot import Joint, JointKind, Robot
-from ident.model.urdf import first_leader, mimics_of, read_urdf
+from ident.model.urdf import first_leader, mimics_of, position_limits_of, read_urdf
 from ident.plausible import (
     ACCELERATION,
     FARTHEST_CENTRE_M,
@@ -109,6 +109,8 @@ def check(
             *_si_faults(model, urdf),
         ]
         faults += _order_faults(model, joints)
+        if robot is not None:
+            faults += _follower_limit_faults(urdf)
     if robot is not None:
         faults += _frame_faults(model, urdf)
     if faults:
@@ -218,6 +220,18 @@ def mimic_faults(axes: Sequence[str], urdf: str) -> Iterator[Fault]:
                 f"`hold` of {first} if that is no axis, and {name} follows it; else an axis of "
                 f"{first}"
             )
+            yield Fault(("robot", "urdf"), found, expected)
+
+
+def _follower_limit_faults(urdf: str) -> Iterator[Fault]:
+    """Find followers whose limits say nothing because they contradict themselves: a plan could not
+    keep them.
+    """
+    mimics = mimics_of(urdf)
+    for name, limits in position_limits_of(urdf).items():
+        if name in mimics and limits.are_contradictory:
+            found = f"joint {name}, which mimics {mimics[name].leader}, with the limits {limits}"
+            expected = "numbers, the lower one first: a plan keeps the limits of a follower"
             yield Fault(("robot", "urdf"), found, expected)
 
 

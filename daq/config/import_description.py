@@ -26,7 +26,7 @@ from daq.config.yaml_file import (
     read_model,
     read_yaml_bytes,
 )
-from daq.errors import ConfigurationInconsistent
+from daq.errors import ConfigurationInconsistent, counted
 
 Column = Annotated[str, Field(min_length=1)] | Annotated[int, Field(ge=1)]
 """Name in the header, or number counted from 1."""
@@ -35,6 +35,7 @@ Rate = Annotated[float, Field(ge=RATES_HZ[0], le=RATES_HZ[1])]
 UnitName = Annotated[str, Field(min_length=1)]
 Factor = Annotated[float, Field(ge=-1e9, le=1e9)]
 SMALLEST_FACTOR = 1e-9
+Topic = Annotated[str, Field(min_length=1)]
 SomeColumns = Annotated[tuple[Column, ...], Field(min_length=1)]
 
 
@@ -145,7 +146,9 @@ class Section:
 class PublishedColumns(Section):
     """Columns of a quantity that a bag has, too."""
 
-    topic: str | None = None  #: topic of these columns in a bag; that of the description by default
+    topic: Topic | None = (
+        None  #: topic of these columns in a bag; that of the description by default
+    )
     #: their publisher; that of the description by default
     publisher: Annotated[int, Field(ge=1)] | None = None
 
@@ -315,7 +318,9 @@ class ImportDescription(StrictModel):
     time: TimeColumn | None = None  #: the time column, instead of a rate
     keep: KeptPart | None = None  #: part of the recording that is imported; all of it by default
     holdout: HoldoutPart | None = None  #: end of it that becomes a second log
-    topic: str | None = None  #: topic of the joint states in a ROS 2 bag; needed if it has several
+    topic: Topic | None = (
+        None  #: topic of the joint states in a ROS 2 bag; needed if it has several
+    )
     #: Which publisher of that topic, by the number that an import names; needed if several publish
     #: the same joints.
     publisher: Annotated[int, Field(ge=1)] | None = None
@@ -385,7 +390,7 @@ def load_import(path: Path) -> ImportDescription:
         # counts.
         own = len(section.places)
         if own != axes and 1 not in {axes, own}:
-            found = f"{own} columns"
+            found = counted(own, "column")
             faults.append(Fault((name, "columns"), found, f"{axes}, as many as of position"))
     columns: list[object] = []
     for of_file in wanted.files().values():

@@ -66,6 +66,8 @@ def _decoded(data: bytes, name: str) -> str:
         raise _refused(
             name, f"byte {error.start} is not in the declared encoding {encoding!r}"
         ) from error
+    except UnicodeError as error:  # of encodings of host names, and of `undefined`
+        raise _refused(name, f"bytes that are not in the declared encoding {encoding!r}") from error
 
 
 def _encoding_of(data: bytes) -> str:

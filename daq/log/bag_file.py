@@ -15,12 +15,22 @@ from tempfile import TemporaryDirectory
 
 import zstandard
 
-from daq.errors import LogCorrupt, LogMissing, LogTruncated, OutputFailed, reason_of
+from daq.config.yaml_file import MAGIC_OF_LOGS
+from daq.errors import (
+    LogCorrupt,
+    LogForeign,
+    LogMissing,
+    LogTruncated,
+    OutputFailed,
+    counted,
+    reason_of,
+)
 from daq.files import open_regular
-from daq.log.container import LARGEST_CHUNK, LARGEST_RATIO, LARGEST_RECORD
+from daq.log.container import LARGEST_CHUNK, LARGEST_RATIO, LARGEST_RECORD, MAGIC
 from daq.log.mcap_bag import ZSTD_MAGIC, BagMessage, McapBag, Topic
 from daq.log.message import JOINTS_SCHEMA
 from daq.log.ros1_bag import ROS_1_MAGIC, Ros1Bag
+from daq.log.table import kind_of_content
 
 SQLITE_MAGIC = b"SQLite format 3\0"
 #: Instructions of SQLite for any file, and STEPS_A_BYTE more for each byte; a message takes 20
@@ -59,6 +69,7 @@ class SqliteBag:
                 (found,) = database.execute("PRAGMA quick_check(1)").fetchone()
                 if found != "ok":
                     raise self._broken(str(self.path), str(found))
+                self._refuse_another_behind(database)
                 yield from self._messages(database)
         except OSError as error:
             raise LogMissing(
@@ -85,6 +96,26 @@ class SqliteBag:
         database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, LARGEST_RECORD)
         database.set_progress_handler(self._count_steps, COUNTED_STEPS)
         database.execute("PRAGMA trusted_schema = OFF")
+
+    def _refuse_another_behind(self, database: sqlite3.Connection) -> None:
+        """Refuse a second database behind the pages of the first, which SQLite does not look at."""
+        (pages,) = database.execute("PRAGMA page_count").fetchone()
+        (page_bytes,) = database.execute("PRAGMA page_size").fetchone()
+        end = pages * page_bytes
+        with open_regular(self._source) as stream:
+            size = os.fstat(stream.fileno()).st_size
+            stream.seek(end)
+            is_another = stream.read(len(SQLITE_MAGIC)) == SQLITE_MAGIC
+        if not is_another:
+            return
+        behind = counted(size - end, "byte")
+        raise LogCorrupt(
+            str(self.path),
+            found=f"{behind} behind its end, which begin as another bag does",
+            expected="one bag",
+            remedy="files joined by `cat` are no bag: give each recording by itself; the first one "
+            f"alone is `head -c {end}` of the file",
+        )
 
     def _count_steps(self) -> bool:
         """Count; SQLite stops at True."""
@@ -176,7 +207,40 @@ def _bag(path: Path, source: Path) -> McapBag | SqliteBag | Ros1Bag:
         return SqliteBag(path, source)
     if head.startswith(ROS_1_MAGIC):
         return Ros1Bag(path, source)
+    if not head.startswith(MAGIC_OF_LOGS):
+        _refuse_other_kind(path, source, head)
     return McapBag(path, source)
+
+
+def _refuse_other_kind(path: Path, source: Path, head: bytes) -> None:
+    """Refuse a file without the first bytes of a bag.
+
+    Raises:
+        LogMissing: it cannot be opened.
+        LogTruncated: it ends within these bytes.
+        LogForeign: it is of another kind.
+    """
+    expected = "a ROS bag: MCAP or SQLite of ROS 2, or one of ROS 1"
+    try:
+        with open_regular(source):
+            pass
+    except OSError as error:
+        raise LogMissing(
+            str(path),
+            found=reason_of(error),
+            expected=expected,
+            remedy="check --data and the file name in the import description",
+        ) from error
+    if any(magic.startswith(head) for magic in (MAGIC, SQLITE_MAGIC, ROS_1_MAGIC)):
+        size = counted(len(head), "byte")
+        raise LogTruncated(
+            str(path),
+            found=f"{size} with which a bag begins",
+            expected="a recording",
+            remedy="copy it again from where it was recorded, or record again",
+        )
+    found, remedy = kind_of_content(head)
+    raise LogForeign(str(path), found=found, expected=expected, remedy=remedy)
 
 
 def first_bytes(path: Path) -> bytes:

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from daq.config.import_description import Column, ImportDescription, KeptPart, TimeColumn, TimeUnit
-from daq.errors import TableUnfit, counted
+from daq.errors import TableUnfit, counted, printable
 from daq.files import read_regular
 from daq.log.bag_file import open_bag
 from daq.log.mcap_bag import JointState, Topic, joint_state_from_cdr, unpack_message
@@ -60,6 +60,14 @@ def read_bag(
             f"`column: {STAMP}` and `unit: ns`",
             "correct `time` in the import description",
         )
+    if not columns:
+        raise _unfit(
+            path,
+            "the time column alone",
+            "`position` or `current` in the bag that has the stamps",
+            "correct `time`: name the file of `position` and `current`, or state `rate_hz` in its "
+            "place; rows of other files have no stamps in a bag",
+        )
     sources = _sources(path, wanted, columns)
     rows: dict[_ColumnSource, _Rows] = {}
     for source, own in sources.items():
@@ -71,7 +79,8 @@ def read_bag(
             for message in messages:
                 topic = message.topic
                 reading = [rows[source] for source in sources if source.reads(topic)]
-                topics[topic.name] = bool(reading)
+                has_been = topics.get(topic.name, False)
+                topics[topic.name] = has_been or topic.has_joint_states
                 if reading:
                     try:
                         state = joint_state_from_cdr(unpack_message(message.data))
@@ -150,25 +159,28 @@ def _require_one_topic(path: Path, source: _ColumnSource, topics: dict[str, bool
     Args:
         path: of the bag.
         source: whose topic is sought.
-        topics: those of the bag, and whether their joint states were read.
+        topics: those of the bag, and whether they have joint states.
     """
-    used = []
-    for topic, has_been_read in topics.items():
-        if has_been_read and source.topic in {None, topic}:
-            used.append(topic)
+    of_joints = [topic for topic, has_joints in topics.items() if has_joints]
+    used = [topic for topic in of_joints if source.topic in {None, topic}]
     if not used:
         found = "no message"
+        remedy = "is this the right bag?"
         if topics:
-            found = f"topics {', '.join(topics)}"
+            listed = ", ".join(map(printable, topics))
+            found = f"topics {listed}"
+        if of_joints and source.topic is not None:
+            listed = ", ".join(map(printable, of_joints))
+            remedy = f"correct `topic` in the import description; joint states are on {listed}"
         sought = source.topic or "a topic"
         expected = f"{sought} of type {JOINTS_SCHEMA}"
-        raise _unfit(path, found, expected, "is this the right bag?")
+        raise _unfit(path, found, expected, remedy)
     if len(used) > 1:
         remedy = (
             "choose one in the import description: `topic: NAME`; where positions and efforts are "
             "on different ones, `topic` under `position` and `current`"
         )
-        listed = ", ".join(used)
+        listed = ", ".join(map(printable, used))
         found = f"joint states on {len(used)} topics, {listed}"
         raise _unfit(path, found, "one topic", remedy)
 
@@ -390,8 +402,10 @@ class _Publisher:
             frame = "without a header"
         else:
             frame = f"frame {self.frame!r}"
-        joints = ", ".join(sorted(self.joints))
-        node = f"{self.node}, " if self.node else ""
+        joints = ", ".join(map(printable, sorted(self.joints)))
+        node = ""
+        if self.node:
+            node = f"{printable(self.node)}, "
         if self.channel > 1:
             node += f"channel {self.channel}, "
         messages = counted(self.messages, "message")
@@ -461,7 +475,7 @@ class _Rows:
                 twice = next(name for name in state.names if state.names.count(name) > 1)
                 raise _unfit(
                     self._path,
-                    f"joint {twice} twice in one message",
+                    f"joint {printable(twice)} twice in one message",
                     "each joint once",
                     "mend its publisher",
                 )
@@ -536,7 +550,9 @@ class _Rows:
         for field, index, column in places:
             numbers: tuple[float, ...] = getattr(state, field)
             if index >= len(numbers):
-                found = f"a message with {len(state.names)} names and {len(numbers)} values"
+                names = counted(len(state.names), "name")
+                values = counted(len(numbers), "value")
+                found = f"a message with {names} and {values}"
                 raise _unfit(
                     self._path,
                     f"{found} of {field}",
@@ -587,7 +603,8 @@ class _Rows:
                     lacking.append(field)
             if lacking:
                 field = lacking[0]
-                found = f"messages with {len(one.joints)} names and 0 values of {field}"
+                names = counted(len(one.joints), "name")
+                found = f"messages with {names} and 0 values of {field}"
                 remedy = "does this controller publish it?"
                 if any(field in other.fields for other in self._publishers.values()):
                     remedy = self._choice_of_each_field()
@@ -751,7 +768,7 @@ class _Rows:
             found: set[str] = set()
             for names in self._places:
                 found.update(names)
-            joints = ", ".join(sorted(found)) or "none"
+            joints = ", ".join(map(printable, sorted(found))) or "none"
             raise _unfit(self._path, f"joints {joints}", f"those of {absent}")
         empty = _listed(columns, np.asarray(~is_number.any(axis=0)))
         if empty:
@@ -898,7 +915,7 @@ def _share_near(steps_s: FloatArray, usual_s: float) -> float:
 
 def _listed(columns: tuple[Column, ...], is_listed: BoolArray) -> str:
     """Name some of the columns; empty without any."""
-    return ", ".join(str(columns[number]) for number in np.flatnonzero(is_listed))
+    return ", ".join(printable(str(columns[number])) for number in np.flatnonzero(is_listed))
 
 
 def _require_possible(time_ns: int) -> None:

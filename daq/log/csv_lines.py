@@ -84,7 +84,7 @@ class CsvLines:
                 return column - 1
             raise TableUnfit(
                 str(self.path),
-                found=f"{width} columns",
+                found=counted(width, "column"),
                 expected=f"a column {column}",
                 remedy="columns count from 1",
             )
@@ -571,7 +571,7 @@ def _check_shape(file: CsvLines, named: int) -> None:
         first = int(wrong[0])
         raise TableUnfit(
             file.row_place(first),
-            found=f"{counts[first]} columns",
+            found=counted(int(counts[first]), "column"),
             expected=f"{usual}, as in {source}",
             remedy="check the delimiter in the import description, and the export",
         )
@@ -583,9 +583,10 @@ def _check_shape(file: CsvLines, named: int) -> None:
     if wrong.size or lacks_last_field:
         excerpt = file.rows[last][-EXCERPT_CHARACTERS:]
         keep = _keep_to(file, last)
+        fields = counted(int(counts[last]), "field")
         raise TableUnfit(
             file.row_place(last),
-            found=f"a last line {excerpt!r} of {counts[last]} fields",
+            found=f"a last line {excerpt!r} of {fields}",
             expected=f"{usual} complete fields",
             remedy="the file ends early; export or copy it again, or leave that line out by "
             f"{keep}",

@@ -21,6 +21,7 @@ import numpy as np
 
 from daq.config.cell import MILLIMETRE, Cell
 from daq.config.cell_file import bundle, load_cell
+from daq.config.foreign_files import HEAD_BYTES, foreign_kind
 from daq.config.import_description import (
     Column,
     CsvLayout,
@@ -34,8 +35,8 @@ from daq.config.import_description import (
     VelocityUnit,
     load_import,
 )
-from daq.errors import ConfigurationInconsistent, TableUnfit, UsageError
-from daq.files import sha256
+from daq.errors import ConfigurationInconsistent, TableUnfit, UsageError, counted
+from daq.files import open_regular, sha256
 from daq.log.bag_file import SQLITE_MAGIC, first_bytes
 from daq.log.bag_table import FIELDS, read_bag
 from daq.log.column_faults import UsedRows, fault_remarks, require_mendable, sound_columns
@@ -63,7 +64,15 @@ from daq.log.plausibility import (
 )
 from daq.log.resampling import Clock, clock_of, on_clock
 from daq.log.ros1_bag import ROS_1_MAGIC
-from daq.log.table import ROW_MARGIN, Reader, Table, compare_stamps, rows_at_rate, section_values
+from daq.log.table import (
+    ROW_MARGIN,
+    Reader,
+    Table,
+    compare_stamps,
+    rows_at_rate,
+    section_values,
+    unreadable,
+)
 from daq.log.writer import LogContent, LogWriter
 from drivers.messages import Quantity, Sample, SlowReading
 from ident.arrays import FloatArray, IntArray
@@ -134,7 +143,9 @@ def import_recording(
         )
     cell_file = cell_path or description.parent / stated.cell
     cell = load_cell(cell_file)
+    _require_files(stated, data)
     with_all_columns = with_columns(stated, data, cell.axis_names)
+    _check_columns(with_all_columns, description, data)
     _check_cell(with_all_columns, cell, description)
     wanted = in_order_of_axes(with_all_columns, cell.axis_names)
     tables = _read_tables(wanted, data)
@@ -337,8 +348,8 @@ def _judged_recording(
     file_position = section_values(wanted.position, tables)
     current = section_values(wanted.current, tables)
     require_changing(file_position, current, wanted, tables)
-    require_own_columns(wanted.position, file_position, tables)
-    require_own_columns(wanted.current, current, tables)
+    both = np.hstack((file_position, current))
+    require_own_columns((wanted.position, wanted.current), both, tables)
     remarks: tuple[str, ...] = ()
     if wanted.position.unit is PositionUnit.COUNTS:
         file_position, remarks = signed_counts(file_position, wanted)
@@ -470,9 +481,10 @@ def _read_tables(wanted: ImportDescription, data: Path) -> dict[str, Table]:
             tables[name] = replace(table, remarks=remarks)
     position = tables[wanted.position.files[0]]
     if len(position.values) < FEWEST_ROWS:
+        rows = counted(len(position.values), "row")
         raise TableUnfit(
             str(position.path),
-            found=f"{len(position.values)} rows of numbers",
+            found=f"{rows} of numbers",
             expected="a row for each sample of a motion",
             remedy="was the export interrupted? export the recording again",
         )
@@ -485,7 +497,10 @@ def _require_equal_rows(tables: Mapping[str, Table]) -> None:
     if len(counts) <= 1:
         return
     paths = [str(table.path) for table in tables.values()]
-    row_counts = [f"{len(table.values)} rows in {name}" for name, table in tables.items()]
+    row_counts: list[str] = []
+    for name, table in tables.items():
+        rows = counted(len(table.values), "row")
+        row_counts.append(f"{rows} in {name}")
     raise TableUnfit(
         ", ".join(paths),
         found=" and ".join(row_counts),
@@ -634,19 +649,57 @@ def _payload(wanted: ImportDescription, cell: Cell) -> Payload | None:
     )
 
 
-def _check_columns(wanted: ImportDescription, description: Path) -> None:
+def _require_files(wanted: ImportDescription, data: Path) -> None:
+    """Refuse files that are not there, or of a kind that no reader takes, before their columns are
+    judged by what a file of another kind would have.
+
+    Raises:
+        TableUnfit: for the first such file.
+    """
+    for file in wanted.files():
+        path = data / file
+        if path.is_dir():
+            continue
+        try:
+            with open_regular(path) as stream:
+                head = stream.read(HEAD_BYTES)
+        except OSError as error:
+            raise unreadable(path, error, "a CSV or MATLAB file, or a ROS bag") from error
+        foreign = foreign_kind(head)
+        if foreign is not None and reader_of(path) is read_csv:
+            raise TableUnfit(
+                str(path),
+                found=foreign.value,
+                expected="a CSV or MATLAB file, or a ROS bag",
+                remedy=foreign.remedy,
+            )
+
+
+def _check_columns(wanted: ImportDescription, description: Path, data: Path) -> None:
     """Refuse a column that is read as two quantities, or as that of two axes:
     one of them would be made up.
+
+    Args:
+        wanted: with a column for each axis.
+        description: its file.
+        data: folder of the files.
     """
     key_by_place: dict[tuple[Path, str], str] = {}
     for key, file, column in _columns_by_key(wanted):
         first_key = key_by_place.setdefault((Path(file), str(column)), key)
         if first_key != key:
+            remedy = "correct `columns` in the import description"
+            is_called_csv = Path(file).suffix.lower() == ".csv"
+            if not is_called_csv and reader_of(data / file) is read_csv:
+                remedy += (
+                    f"; if {file} is to be a bag, whose joints are in both: its content is no bag, "
+                    "and it is read as a CSV file"
+                )
             raise ConfigurationInconsistent(
                 f"{description}: {key}",
                 found=f"column {column} of {file}, which is also {first_key}",
                 expected="a column of its own for each quantity of each axis",
-                remedy="correct `columns` in the import description",
+                remedy=remedy,
             )
 
 
@@ -666,10 +719,9 @@ def _check_cell(wanted: ImportDescription, cell: Cell, description: Path) -> Non
         ConfigurationInconsistent: names the key of the description.
     """
     axis_count = len(cell.axes)
-    _check_columns(wanted, description)
     for key, section in wanted.sections():
         if len(section.places) != axis_count:
-            found = f"{len(section.places)} columns"
+            found = counted(len(section.places), "column")
             expected = f"{axis_count}, one for each axis of cell {cell.name!r}"
             raise ConfigurationInconsistent(
                 f"{description}: {key}.columns",

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daq.config.import_description import Column, ImportDescription, TimeColumn, TimeUnit
-from daq.errors import TableUnfit, first_few
+from daq.errors import TableUnfit, counted, first_few, printable
 from daq.files import read_regular
 from daq.log.table import (
     MIDNIGHT,
@@ -33,6 +33,7 @@ from daq.log.table import (
     counter_wraps,
     cut_stamps,
     digest_of,
+    kind_of_content,
     repeated,
     require_finite,
     require_kept,
@@ -49,6 +50,7 @@ LARGEST_BYTES = 2**31 - 1  #: Largest file and variable; the format has no large
 LARGEST_RATIO = 200
 SMALL_BYTES = 64 * 2**20
 _HEADER_BYTES = 128
+_SHOWN_BYTES = 20  #: Of a file of another kind, in a message
 _PEEK_BYTES = 4096  #: Class, dimensions and name of a variable are in its first bytes
 
 # Types of elements and classes of arrays, by their numbers in the format.
@@ -98,9 +100,10 @@ def read_mat(
     found = [file.column(name) for name in names]
     lengths = [len(numbers) for numbers in found]
     if len(set(lengths)) > 1:
-        described = [
-            f"{length} values in {name}" for name, length in zip(names, lengths, strict=True)
-        ]
+        described: list[str] = []
+        for name, length in zip(names, lengths, strict=True):
+            values_there = counted(length, "value")
+            described.append(f"{values_there} in {name}")
         raise TableUnfit(
             str(path),
             found=", ".join(described),
@@ -164,17 +167,35 @@ def _content(path: Path) -> memoryview:
     except OSError as error:
         raise unreadable(path, error, "a MATLAB file (.mat) of at most 2 GB") from error
     byte_order = content[126:128]
-    if content.startswith(MAGIC) and byte_order in (b"IM", b"MI"):
+    has_magic = content.startswith(MAGIC)
+    if has_magic and byte_order in (b"IM", b"MI"):
         return memoryview(content)
+    is_begin = 0 < len(content) < _HEADER_BYTES and content.startswith(MAGIC[: len(content)])
+    if is_begin:
+        size = counted(len(content), "byte")
+        raise _damaged(path, f"{size} of a header of {_HEADER_BYTES}")
+    if has_magic:
+        raise _damaged(path, "no mark of the order of bytes in its header")
     if b"\x89HDF\r\n" in content[: 512 + 8]:
         found = "a MATLAB file of format 7.3 (HDF5)"
+        remedy = "in MATLAB: save('run.mat', 'q', 'i', 't', '-v7') with the names of your variables"
     else:
-        found = f"first bytes {content[:20]!r}"
+        found, remedy = kind_of_content(content[:_SHOWN_BYTES])
     raise TableUnfit(
         str(path),
         found=found,
         expected="a MATLAB file of format 5, as `save -v7` writes it",
-        remedy="in MATLAB: save('run.mat', 'q', 'i', 't', '-v7') with the names of your variables",
+        remedy=remedy,
+    )
+
+
+def _damaged(path: Path, found: str) -> TableUnfit:
+    """Make the error for a file that is none to its end."""
+    return TableUnfit(
+        str(path),
+        found=f"a damaged MATLAB file ({found})",
+        expected="whole variables",
+        remedy="the file ends early or was changed: save or copy it again",
     )
 
 
@@ -210,6 +231,8 @@ class _MatFile:
             self._variables = dict(self._found(content[_HEADER_BYTES:]))
         except (ValueError, struct.error, zlib.error) as error:
             raise self._broken(error) from error
+        if not self._variables:
+            raise _damaged(path, "its header alone, without a variable")
 
     def _found(self, data: memoryview) -> Iterator[tuple[str, tuple[_Array, memoryview | None]]]:
         """Name, array and packed bytes of each variable;
@@ -253,7 +276,8 @@ class _MatFile:
                 known = f"{name}.1"
             else:
                 known = f"{name}.1 to {name}.{width}"
-            raise self._unfit(f"column {column}, and {name} has {width} columns", f"one of {known}")
+            columns = counted(width, "column")
+            raise self._unfit(f"column {column}, and {name} has {columns}", f"one of {known}")
         return values[:, number - 1]
 
     def _numbers(self, name: str, parts: list[str]) -> NDArray[Any]:
@@ -262,13 +286,16 @@ class _MatFile:
         if array.kind not in (*_FLOATS, *_INTEGERS) or array.imaginary:
             raise self._unfit(f"{name}, {array}", "real numbers")
         sides = [side for side in array.shape if side != 1]
-        if not sides or len(sides) > 2 or 0 in sides:
+        if not sides or len(sides) > 2 or min(sides) < 1:
             raise self._unfit(
                 f"{name} of size {array}", "a column for each axis, a row for each sample"
             )
         kind, data, _ = self._element(array.body, 0)
         element_type = _TYPES.get(kind, "V1")
-        values = np.frombuffer(data, dtype=self._order + element_type)
+        dtype = np.dtype(self._order + element_type)
+        if len(data) % dtype.itemsize:
+            raise ValueError(f"{len(data)} bytes of numbers of {dtype.itemsize} bytes each")
+        values = np.frombuffer(data, dtype=dtype)
         if values.dtype.kind == "V" or len(values) != prod(sides):
             raise ValueError(f"{len(values)} numbers for {array}")
         table = values.reshape(sides[0], -1, order="F")
@@ -370,12 +397,10 @@ class _MatFile:
         return TableUnfit(str(self._path), found=found, expected=expected, remedy=remedy)
 
     def _broken(self, error: Exception) -> TableUnfit:
-        return TableUnfit(
-            str(self._path),
-            found=f"a damaged MATLAB file ({error})",
-            expected="whole variables",
-            remedy="the file ends early or was changed: save or copy it again",
-        )
+        if type(error) is ValueError:
+            return _damaged(self._path, str(error))
+        # Of other errors the text is about buffers and streams of Python.
+        return _damaged(self._path, "bytes that are no variable")
 
 
 def _text(data: memoryview) -> str:
@@ -384,5 +409,5 @@ def _text(data: memoryview) -> str:
 
 def _listed(arrays: dict[str, _Array], before: str = "") -> str:
     """Name up to twelve arrays with their sizes."""
-    names = [f"{before}{name} ({array})" for name, array in arrays.items()]
+    names = [f"{before}{printable(name)} ({array})" for name, array in arrays.items()]
     return first_few(names, 12, separator=", ") or "none"

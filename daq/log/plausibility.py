@@ -15,6 +15,7 @@ import numpy as np
 
 from daq.config.cell import Cell
 from daq.config.import_description import (
+    Column,
     ImportDescription,
     PositionColumns,
     PositionUnit,
@@ -268,17 +269,23 @@ def require_changing(
             )
 
 
-def require_own_columns(section: Section, values: FloatArray, files: Mapping[str, Table]) -> None:
-    """Refuse the same numbers for two axes: one of the columns, or of the files, is a copy.
+def require_own_columns(
+    sections: Sequence[Section], values: FloatArray, files: Mapping[str, Table]
+) -> None:
+    """Refuse the same numbers for two axes or quantities: one of the columns, of the variables or
+    of the files is a copy.
 
     Args:
-        section: with the columns.
-        values: as their files have them, shape (rows, n).
+        sections: with the columns.
+        values: of all sections, as their files have them, shape (rows, n).
         files: the tables, by the name of their file.
 
     Raises:
         TableUnfit: two columns that change are equal in every row.
     """
+    places: list[tuple[str, Column]] = []
+    for section in sections:
+        places += section.places
     index_by_content: dict[bytes, int] = {}
     for index in range(values.shape[1]):
         numbers = values[:, index]
@@ -287,13 +294,14 @@ def require_own_columns(section: Section, values: FloatArray, files: Mapping[str
         first_index = index_by_content.setdefault(numbers.tobytes(), index)
         if first_index == index:
             continue
-        first_file, first_column = section.places[first_index]
-        file, column = section.places[index]
+        first_file, first_column = places[first_index]
+        file, column = places[index]
         raise TableUnfit(
             f"{files[file].path}, column {column}",
             found=f"the same number as column {first_column} of {first_file} in all "
             f"{len(numbers)} rows",
-            expected="a column of its own for each axis: no two axes read alike to the last digit",
+            expected="a column of its own for each quantity of each axis: no two read alike to the "
+            "last digit",
             remedy="one of them is a copy: export the axis again, and correct `file` or `columns` "
             "in the description",
         )

@@ -16,7 +16,7 @@ import numpy as np
 import scipy
 
 from daq.config.import_description import RATES_HZ, TimeColumn
-from daq.errors import TableUnfit
+from daq.errors import TableUnfit, counted
 from daq.log.metadata import Timing
 from daq.log.table import Table
 from ident.arrays import BoolArray, FloatArray, IntArray
@@ -124,9 +124,11 @@ def clock_of(table: Table, wanted: TimeColumn, numbers: FloatArray) -> Clock:
     row = row[is_far]
     time_s = time_s[is_far]
     if len(row) < 3:
+        stamps = counted(len(row), "different time stamp")
+        rows = counted(len(numbers), "row")
         raise TableUnfit(
             str(table.path),
-            found=f"{len(row)} different time stamps in {len(numbers)} rows",
+            found=f"{stamps} in {rows}",
             expected="one for each sample",
             remedy="correct `column` and `unit` of `time` in the import description, or give "
             "rate_hz instead",

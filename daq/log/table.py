@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from daq.config.foreign_files import foreign_kind
 from daq.config.import_description import (
     Column,
     ImportDescription,
@@ -183,6 +184,28 @@ def unreadable(path: Path, error: OSError, expected: str) -> TableUnfit:
         expected=expected,
         remedy="check --data and the file name in the import description",
     )
+
+
+def kind_of_content(head: bytes) -> tuple[str, str]:
+    """Return the kind of a file that is not the expected one, and what to do, in words.
+
+    Args:
+        head: its first bytes, at least HEAD_BYTES of `foreign_files` where it has as many.
+    """
+    foreign = foreign_kind(head)
+    if foreign is not None:
+        return foreign.value, foreign.remedy
+    if not head:
+        return "an empty file", "export or copy it again"
+    wrong_file = "correct `file` in the import description, or export the file again"
+    is_text = all(byte in b"\t\n\r" or byte >= 0x20 for byte in head)
+    if is_text:
+        first_line = head.decode("utf-8", errors="replace").splitlines()[0]
+        return (
+            f"a text file that begins with {first_line!r}",
+            f"if it is a CSV file, give it a name that ends in .csv; else {wrong_file}",
+        )
+    return "a file of an unknown kind", wrong_file
 
 
 def repeated(path: Path, column: Column, names: str) -> TableUnfit:

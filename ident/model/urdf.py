@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from math import atan2, cos, inf, isfinite, sin, sqrt
+from math import atan2, cos, inf, isfinite, nan, sin, sqrt
 from os import PathLike
 from xml.etree.ElementTree import Element, ParseError, fromstring, tostring
 
@@ -57,6 +57,10 @@ LARGEST_DISTANCE_M = 50.0  #: Between joints that follow each other: more than a
 LEAST_MASS = 1e-9
 LARGEST_MASS = 1e9
 LARGEST_INERTIA = 1e15
+#: Of a joint that follows another one: a rack has 1e3 rad/m, a fine screw 1e-5 m/rad
+LEAST_MULTIPLIER = 1e-9
+LARGEST_MULTIPLIER = 1e6
+LARGEST_OFFSET = 1e6  #: [rad or m]; likewise
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -270,7 +274,8 @@ def mimics_of(urdf: str) -> dict[str, Mimic]:
     """Return the joints of a URDF that move and mimic another one, by name.
 
     Raises:
-        ModelError: the text is no URDF, or a multiplier or an offset is no number.
+        ModelError: the text is no URDF, or a multiplier or an offset is no number, or one that no
+            mechanism has.
     """
     robot = _root(urdf)
     return _mimics(_movable(robot))
@@ -293,7 +298,8 @@ def first_leader(name: str, mimics: Mapping[str, Mimic]) -> Mimic:
         mimics: of the URDF (`mimics_of`).
 
     Raises:
-        ModelError: the chain leads back to one of its joints.
+        ModelError: the chain leads back to one of its joints, or multiplies to a number that no
+            mechanism has.
     """
     seen = {name}
     found = mimics[name]
@@ -309,6 +315,7 @@ def first_leader(name: str, mimics: Mapping[str, Mimic]) -> Mimic:
         multiplier = found.multiplier * before.multiplier
         offset = found.multiplier * before.offset + found.offset
         found = Mimic(leader=before.leader, multiplier=multiplier, offset=offset)
+        _require_mechanism(name, found)
     return found
 
 
@@ -347,8 +354,26 @@ def _mimics(movable: Mapping[str, Element]) -> dict[str, Mimic]:
             raise ModelError(
                 f"<mimic> of {name!r} in the URDF has a multiplier or offset that is no number"
             )
-        found[name] = Mimic(mimic.get("joint", ""), multiplier, offset)
+        follows = Mimic(mimic.get("joint", ""), multiplier, offset)
+        _require_mechanism(name, follows)
+        found[name] = follows
     return found
+
+
+def _require_mechanism(name: str, mimic: Mimic) -> None:
+    """Refuse a follower that no mechanism moves so: positions and torques of it would overflow."""
+    size = abs(mimic.multiplier)
+    if not mimic.at_rest and not LEAST_MULTIPLIER <= size <= LARGEST_MULTIPLIER:
+        raise ModelError(
+            f"joint {name!r} mimics joint {mimic.leader!r} with the multiplier "
+            f"{mimic.multiplier:g}; expected a size of {LEAST_MULTIPLIER:g} to "
+            f"{LARGEST_MULTIPLIER:g}: correct <mimic> of {name!r}"
+        )
+    if abs(mimic.offset) > LARGEST_OFFSET:
+        raise ModelError(
+            f"joint {name!r} mimics joint {mimic.leader!r} with the offset {mimic.offset:g}; "
+            f"expected at most {LARGEST_OFFSET:g} rad or m: correct <mimic> of {name!r}"
+        )
 
 
 def _followed(mimics: Mapping[str, Mimic], position_rad: Mapping[str, float]) -> dict[str, float]:
@@ -634,8 +659,8 @@ def _joint(element: Element, at: Place) -> Joint:
     lowest: float | None = None
     travel: float | None = None
     limits = _position_limits(element)
-    if limits is not None:
-        lowest, highest = limits
+    if limits is not None and limits.range is not None:
+        lowest, highest = limits.range
         travel = highest - lowest
     return Joint(
         name=name,
@@ -649,20 +674,60 @@ def _joint(element: Element, at: Place) -> Joint:
     )
 
 
-def _position_limits(element: Element) -> tuple[float, float] | None:
-    """Lowest and highest position of a joint [rad or m]; None where its limits say nothing."""
+@dataclass(frozen=True, slots=True)
+class PositionLimits:
+    """Limits of a joint as its URDF writes them; a bound that is left out is 0, as URDF says."""
+
+    lower: str
+    upper: str
+
+    @property
+    def range(self) -> tuple[float, float] | None:
+        """Lowest and highest position [rad or m]; None where the limits say nothing."""
+        lower, upper = self._numbers()
+        # Some exporters write the largest float where a joint has no limit.
+        if 0.0 < upper - lower <= LARGEST_NUMBER:
+            return lower, upper
+        return None
+
+    @property
+    def are_contradictory(self) -> bool:
+        """Whether a bound is no number, or the upper one is below the lower one."""
+        lower, upper = self._numbers()
+        return not lower <= upper
+
+    def _numbers(self) -> tuple[float, float]:
+        try:
+            return float(self.lower), float(self.upper)
+        except ValueError:
+            return nan, nan
+
+    def __str__(self) -> str:
+        return f"lower={self.lower!r} and upper={self.upper!r}"
+
+
+def position_limits_of(urdf: str) -> dict[str, PositionLimits]:
+    """Return the limits of the movable joints of a URDF that have some, by name.
+
+    Raises:
+        ModelError: the text is no URDF.
+    """
+    found: dict[str, PositionLimits] = {}
+    for name, joint in _movable(_root(urdf)).items():
+        limits = _position_limits(joint)
+        if limits is not None:
+            found[name] = limits
+    return found
+
+
+def _position_limits(element: Element) -> PositionLimits | None:
+    """Limits of a joint; None for one that has none."""
     limit = element.find("limit")
     if limit is None or element.get("type") == "continuous":
         return None
-    try:
-        upper = float(limit.get("upper", ""))
-        lower = float(limit.get("lower", ""))
-    except ValueError:
-        return None
-    # Some exporters write the largest float where a joint has no limit.
-    if 0.0 < upper - lower <= LARGEST_NUMBER:
-        return lower, upper
-    return None
+    lower = limit.get("lower", "0")
+    upper = limit.get("upper", "0")
+    return PositionLimits(lower, upper)
 
 
 def _effort_limit(element: Element) -> float:
@@ -818,7 +883,13 @@ def _vector(element: Element, key: str, name: str) -> FloatArray:
         raise ModelError(
             f"<{element.tag}> of {name!r} in the URDF has {key}={text!r}; expected three numbers"
         )
-    return np.array(numbers, dtype=np.float64)
+    vector = np.array(numbers, dtype=np.float64)
+    if np.max(np.abs(vector)) > LARGEST_NUMBER:
+        raise ModelError(
+            f"<{element.tag}> of {name!r} in the URDF has {key}={text!r}; expected at most "
+            f"{LARGEST_NUMBER:g} in each of three numbers"
+        )
+    return vector
 
 
 def _number(element: Element, key: str, name: str) -> float:

@@ -667,6 +667,43 @@ FOLLOWER = """
 </robot>"""  # noqa: E501
 
 
+@pytest.mark.parametrize(
+    ("limits", "written"),
+    [
+        ('lower="1" upper="-1"', "lower='1' and upper='-1'"),
+        ('lower="-1" upper="nan"', "lower='-1' and upper='nan'"),
+        ('lower="-1" upper="one"', "lower='-1' and upper='one'"),
+        ('lower="1"', "lower='1' and upper='0'"),
+    ],
+    ids=["swapped", "not a number", "text", "one-sided"],
+)
+def test_limits_of_a_follower_that_contradict_themselves_are_refused(
+    limits: str, written: str, configurations: Path
+) -> None:
+    """Without them, nothing kept a plan from moving the follower too far."""
+    follower = FOLLOWER.replace('lower="-1" upper="1"', limits)
+    _spoil(configurations / "robots/tx40.urdf", "</robot>", follower)
+    with pytest.raises(
+        ConfigurationInconsistent,
+        match=f"joint rod, which mimics J5, with the limits {written}; expected numbers",
+    ):
+        load_cell(configurations / "cells/tx40.yaml")
+
+
+def test_a_bound_that_is_left_out_is_zero_for_a_follower_and_a_held_joint(
+    configurations: Path, with_gripper: Path
+) -> None:
+    """As the definition of URDF has it."""
+    urdf = configurations / "robots/tx40.urdf"
+    one_sided = urdf.read_text().replace('lower="-1" upper="1"', 'lower="-1"')
+    urdf.write_text(one_sided)
+    joints = {joint.name: joint for joint in read_urdf(one_sided).joints}
+    assert joints["swivel"].range == (-1.0, 0.0)
+    path = _spoil(with_gripper, "\naxes:", "\nhold: {swivel: 10, slide: 0}\naxes:")
+    with pytest.raises(ConfigurationInconsistent, match=r"found 10 deg; expected -57\.3 to 0 deg"):
+        load_cell(path)
+
+
 def test_a_joint_that_mimics_an_axis_follows_it(configurations: Path) -> None:
     path = configurations / "robots/tx40.urdf"
     _spoil(path, "</robot>", FOLLOWER)

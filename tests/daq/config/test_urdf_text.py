@@ -53,6 +53,10 @@ def test_lines_before_the_declaration_are_left_out() -> None:
     [
         ("klingon", "found the encoding 'klingon', which is not known"),
         ("us-ascii", "byte 55 is not in the declared"),
+        ("punycode", r"byte.* not in the declared encoding 'punycode'"),
+        ("undefined", "bytes that are not in the declared encoding 'undefined'"),
+        ("idna", r"byte.* not in the declared encoding 'idna'"),
+        ("hex", "found the encoding 'hex', which is not known"),
     ],
 )
 def test_what_the_declaration_does_not_explain_is_refused(encoding: str, message: str) -> None:

@@ -29,8 +29,17 @@ from daq.config.import_description import (
     Side,
     TimeColumn,
     TimeUnit,
+    load_import,
 )
-from daq.errors import ConfigurationInconsistent, DataError, LogForeign, LogTruncated, TableUnfit
+from daq.errors import (
+    ConfigurationInconsistent,
+    DaqError,
+    DataError,
+    LogForeign,
+    LogTruncated,
+    SchemaMismatch,
+    TableUnfit,
+)
 from daq.log.bag_table import STAMP, interleaved, read_bag
 from daq.log.conversion import load_run
 from daq.log.importing import import_recording
@@ -714,9 +723,41 @@ def test_a_topic_is_chosen(tmp_path: Path) -> None:
         read(bag)
     assert_whole(read(bag, topic="/joint_states"))
     with pytest.raises(
-        TableUnfit, match="found topics /desired, /joint_states; expected /arm of type sensor_msgs"
+        TableUnfit,
+        match=r"found topics /desired, /joint_states; expected /arm of type sensor_msgs.*; correct "
+        r"`topic` .*; joint states are on /desired, /joint_states$",
     ):
         read(bag, topic="/arm")
+
+
+@pytest.mark.parametrize("section", [None, "position", "current"])
+def test_an_empty_topic_is_refused_in_the_description(
+    section: str | None, checkout: Path, tmp_path: Path
+) -> None:
+    document = _document(checkout)
+    keys = document
+    if section is not None:
+        keys = document[section]
+    keys["topic"] = ""
+    description = _write_description(tmp_path, document)
+    with pytest.raises(SchemaMismatch, match="topic"):
+        load_import(description)
+
+
+def test_stamps_alone_from_a_bag_are_refused(tmp_path: Path) -> None:
+    bag = write_bag(tmp_path / "run.mcap", recording())
+    with pytest.raises(TableUnfit, match=r"found the time column alone; .*correct `time`"):
+        read(bag, ())
+
+
+def test_names_with_line_ends_are_escaped_in_a_message(tmp_path: Path) -> None:
+    names = ["J1\nfound", "J2\r\n", "J3", "J4", "J5", "J6"]
+    messages = joint_states([message(0, name=names)])
+    bag = write_bag(tmp_path / "run.mcap", messages)
+    with pytest.raises(TableUnfit) as caught:
+        read(bag, ("position.J3", "position.J7"))
+    assert str(caught.value).isprintable()
+    assert r"'J1\nfound'" in caught.value.found
 
 
 @pytest.mark.parametrize(
@@ -805,6 +846,29 @@ def test_a_bag_is_imported_with_its_joints_as_axes(checkout: Path, tmp_path: Pat
     refused = tmp_path / "x.mcap"
     code = run_verb("import", description, "--data", tmp_path, "--out", refused)
     assert code == 4
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (None, r"nowhere: found no such file .*; expected a CSV or MATLAB file, or a ROS bag"),
+        (b"PAR1" + bytes(20), "nowhere: found a Parquet file; expected a CSV or MATLAB file, or"),
+        (b"J1,J2\n1,2\n", "which is also position.columns.*nowhere is to be a bag.*is no bag"),
+    ],
+    ids=["missing", "parquet", "text"],
+)
+def test_the_same_joints_of_a_file_that_is_no_bag_are_answered_by_the_file(
+    content: bytes | None, message: str, checkout: Path, tmp_path: Path
+) -> None:
+    document = _document(checkout)
+    for key in ("position", "current"):
+        document[key] |= {"file": "nowhere", "columns": list(JOINTS)}
+    document["time"]["file"] = "nowhere"
+    if content is not None:
+        (tmp_path / "nowhere").write_bytes(content)
+    description = _write_description(tmp_path, document)
+    with pytest.raises(DaqError, match=message):
+        import_recording(description, tmp_path, tmp_path / "log.mcap", software="test")
 
 
 @pytest.mark.parametrize("columns", [list(JOINTS), ["effort"], list(POSITION_COLUMNS)])

@@ -23,7 +23,15 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 from rosbags.typesys import Stores, get_typestore
 
 from daq.cli import main
-from daq.errors import DataError, ExitCode, LogCorrupt, LogTruncated, TableUnfit
+from daq.errors import (
+    DataError,
+    ExitCode,
+    LogCorrupt,
+    LogForeign,
+    LogMissing,
+    LogTruncated,
+    TableUnfit,
+)
 from daq.log.bag_file import open_bag
 from daq.log.importing import reader_of
 from daq.log.mcap_bag import unpack_message
@@ -92,6 +100,44 @@ def test_a_file_that_a_player_has_unpacked_is_read_once(tmp_path: Path) -> None:
     with packed.open("rb") as stream, (folder / "bag.db3").open("wb") as unpacked:
         zstandard.ZstdDecompressor().copy_stream(stream, unpacked)
     assert_whole(read(folder))
+
+
+@pytest.mark.parametrize(
+    ("content", "kind", "message"),
+    [
+        (b"notes of the run\n", LogForeign, "a text file that begins with 'notes of the run'"),
+        (b"t,q1\n0,1\n", LogForeign, "a text file that begins with 't,q1'"),
+        (b"PAR1" + bytes(20), LogForeign, "a Parquet file"),
+        (bytes(30), LogForeign, "a file of an unknown kind"),
+        (b"#ROSB", LogTruncated, "5 bytes with which a bag begins; .*copy it again"),
+        (b"SQLite", LogTruncated, "6 bytes with which a bag begins"),
+        (b"\x89MC", LogTruncated, "3 bytes with which a bag begins"),
+    ],
+)
+def test_a_file_that_is_no_bag_is_named_by_its_kind(
+    content: bytes, kind: type[DataError], message: str, tmp_path: Path
+) -> None:
+    """The advice was that of commands that take logs."""
+    path = tmp_path / "run.bag"
+    path.write_bytes(content)
+    with pytest.raises(kind, match=f"found {message}") as caught:
+        read(path)
+    assert "command's help" not in str(caught.value)
+
+
+def test_a_bag_that_is_not_there_is_called_missing(tmp_path: Path) -> None:
+    with pytest.raises(LogMissing, match=r"no such file .*; expected a ROS bag.*--data"):
+        read(tmp_path / "run.bag")
+
+
+def test_two_databases_in_one_file_are_refused(tmp_path: Path) -> None:
+    """SQLite reads the first one, and does not look behind it."""
+    folder = record(tmp_path / "bag", StoragePlugin.SQLITE3, CompressionMode.NONE)
+    file = folder / "bag.db3"
+    content = file.read_bytes()
+    file.write_bytes(content + content)
+    with pytest.raises(LogCorrupt, match=f"{len(content)} bytes behind its end, .* another bag"):
+        read(file)
 
 
 @pytest.fixture(scope="module")

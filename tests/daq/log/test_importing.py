@@ -27,7 +27,14 @@ from daq.config.cell import model_of
 from daq.config.cell_file import load_cell
 from daq.config.import_description import ImportDescription
 from daq.config.yaml_file import parse_yaml, read_model
-from daq.errors import ConfigurationInconsistent, ExitCode, OutputFailed, TableUnfit, UsageError
+from daq.errors import (
+    ConfigurationInconsistent,
+    ExitCode,
+    OutputFailed,
+    TableUnfit,
+    UsageError,
+    counted,
+)
 from daq.log.conversion import load_run
 from daq.log.importing import Imported, import_recording, quantise
 from daq.log.reader import read_log
@@ -715,7 +722,8 @@ def test_a_row_or_two_are_no_recording(
     path = inputs.data / "run.csv"
     header_and_rows = read_lines(path)[: rows + 1]
     write_lines(path, header_and_rows)
-    _refused(inputs, capsys, 4, f"{rows} rows of numbers", "was the export interrupted?")
+    found = f"{counted(rows, 'row')} of numbers"
+    _refused(inputs, capsys, 4, found, "was the export interrupted?")
 
 
 @pytest.mark.parametrize("change", [0.2, 0.4, -0.3])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import json
 import pickle
 import random
@@ -20,6 +21,7 @@ from scipy.io import savemat
 from daq.config.import_description import ImportDescription, KeptPart, TimeColumn, TimeUnit
 from daq.errors import TableUnfit
 from daq.log.conversion import load_run
+from daq.log.importing import import_recording
 from daq.log.mat_table import read_mat
 from daq.log.table import Table
 from tests.daq.command_line import run_verb
@@ -123,7 +125,7 @@ def test_any_matrix_comes_back(
         (("q",), r"column q, and q has 6 columns; expected one of q.1 to q.6"),
         (("q.7",), "column q.7"),
         (("q.0",), "column q.0"),
-        (("t.2",), "t has 1 columns; expected one of t.1"),
+        (("t.2",), "t has 1 column; expected one of t.1"),
         (("q.q",), "q.q, where q is 300×6; expected VARIABLE, or STRUCT.FIELD"),
         (("run",), "run, where run is 1×1 struct"),
         (("run.i",), r"no field 'run.i'; expected one of run.q \(300×6\)"),
@@ -174,10 +176,23 @@ def test_what_is_no_column_of_numbers_is_named(
         ),
         (
             pickle.dumps({"q": [1, 2]}),
-            "first bytes .*; expected a MATLAB file of format 5, as `save -v7` writes it",
+            "a file of an unknown kind; expected a MATLAB file of format 5, as `save -v7` writes "
+            "it; correct `file`",
         ),
-        (b"", "first bytes b''"),
-        (b"MATLAB 5.0 MAT-file".ljust(126) + b"IM", "no variable 'q'; expected one of none"),
+        (b"", "found an empty file; expected a MATLAB file"),
+        (gzip.compress(b"x", mtime=0), r"found a file packed by gzip; .*gunzip"),
+        (b"PK\x03\x04" + bytes(60), "found a ZIP archive"),
+        (b"t,q1,q2\n0,1,2\n", r"a text file that begins with 't,q1,q2'; .*ends in \.csv"),
+        (b"MATLAB 5.0", r"damaged MATLAB file \(10 bytes of a header of 128\); .*copy it again"),
+        (b"MATLAB 5.0 MAT-file".ljust(128), "no mark of the order of bytes"),
+        (
+            b"MATLAB 5.0 MAT-file".ljust(126) + b"IM",
+            r"damaged MATLAB file \(its header alone, without a variable\)",
+        ),
+        (
+            b"MATLAB 5.0 MAT-file".ljust(126) + b"IM" + bytes(5),
+            r"damaged MATLAB file \(bytes that are no variable\)",
+        ),
     ],
 )
 def test_files_of_other_formats_are_refused(content: bytes, message: str, tmp_path: Path) -> None:
@@ -328,6 +343,29 @@ def test_a_matrix_is_imported_with_its_columns_as_axes(checkout: Path, tmp_path:
     position_rad = np.radians(Q)
     np.testing.assert_allclose(run.position_rad, position_rad, atol=2e-9)
     np.testing.assert_allclose(run.current_a, CURRENT, atol=1e-9)
+
+
+def test_a_variable_that_is_a_copy_of_the_positions_is_no_current(
+    checkout: Path, tmp_path: Path
+) -> None:
+    savemat(tmp_path / "run.mat", {"q": Q, "i": Q})
+    description = tmp_path / "run.yaml"
+    position = {"file": "run.mat", "columns": ["q"], "unit": "deg", "side": "joint"}
+    current = {"file": "run.mat", "columns": ["i"], "unit": "A"}
+    document = {
+        "name": "run",
+        "cell": str(checkout / "configs/cells/demo.yaml"),
+        "position": position,
+        "current": current,
+        "rate_hz": 1000.0,
+    }
+    description.write_text(json.dumps(document))
+    with pytest.raises(
+        TableUnfit,
+        match=r"column i\.1: found the same number as column q\.1 of run\.mat in all 300 rows; "
+        "expected a column of its own for each quantity",
+    ):
+        import_recording(description, tmp_path, tmp_path / "log.mcap", software="test")
 
 
 def test_stamps_and_numbers_of_columns_without_end_are_refused(tmp_path: Path) -> None:

@@ -207,5 +207,5 @@ def test_a_stated_rate_far_from_that_of_the_stamps_is_refused(rate_hz: float) ->
 def test_a_column_that_is_no_time_is_refused() -> None:
     numbers = np.zeros((50, 1))
     time_s = np.zeros(50)
-    with pytest.raises(TableUnfit, match="1 different time stamps in 50 rows"):
+    with pytest.raises(TableUnfit, match="1 different time stamp in 50 rows"):
         _clock(time_s, numbers=numbers)

@@ -125,6 +125,43 @@ def test_an_unfinished_bag_says_how_to_repair_it(tmp_path: Path) -> None:
         read(bag)
 
 
+def test_a_bag_packed_by_bz2_with_a_damaged_byte_is_called_damaged(tmp_path: Path) -> None:
+    bag = record(tmp_path / "run.bag", Writer.CompressionFormat.BZ2)
+    content = bytearray(bag.read_bytes())
+    packed_at = content.index(b"BZh9")
+    content[packed_at + 2000] ^= 0xFF
+    bag.write_bytes(content)
+    with pytest.raises(LogCorrupt, match=r"found damaged bytes; .*copy it again"):
+        read(bag)
+
+
+def test_an_index_that_does_not_fit_the_messages_is_called_damaged(tmp_path: Path) -> None:
+    """The library asserts it, without words."""
+    bag = record(tmp_path / "run.bag")
+    content = bytearray(bag.read_bytes())
+    header_bytes = bytes([47, 0, 0, 0])
+    in_index = content.index(b"op=\x04")
+    record_at = content.rindex(header_bytes, 0, in_index)
+    first_time_at = record_at + 4 + 47 + 4
+    content[first_time_at] ^= 0x01
+    bag.write_bytes(content)
+    with pytest.raises(LogCorrupt, match=r"found damaged bytes; .*copy it again"):
+        read(bag)
+
+
+def test_two_bags_in_one_file_are_refused(tmp_path: Path) -> None:
+    """The second one was left out without a word."""
+    bag = record(tmp_path / "run.bag")
+    content = bag.read_bytes()
+    bag.write_bytes(content + content)
+    behind = f"found {len(content)} bytes behind its end, which begin as another bag does"
+    with pytest.raises(LogCorrupt, match=f"{behind}; .*`head -c {len(content)}`"):
+        read(bag)
+    bag.write_bytes(content + b"\n")
+    with pytest.raises(LogCorrupt, match="found 1 byte behind its end; expected one bag"):
+        read(bag)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("size", [LARGEST_CHUNK, LARGEST_CHUNK + 1])
 def test_a_chunk_that_unfolds_to_more_than_a_chunk_is_refused(size: int) -> None:

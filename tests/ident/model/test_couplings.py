@@ -4,6 +4,7 @@ motion and torque against Pinocchio, and the gains of an arm.
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -338,3 +339,33 @@ def test_a_motor_on_a_follower_and_a_follower_in_a_closed_chain_are_refused() ->
         match=r"joint 'rod' has <mimic>, and the robot has closures; .* delete <mimic>",
     ):
         robot_from_urdf(_arm(), closures=(loop,), motors=("turn", "shoulder"))
+
+
+@pytest.mark.parametrize(
+    ("multiplier", "offset", "found"),
+    [
+        ("1e300", "0", "the multiplier 1e\\+300"),
+        ("1e29", "0", "the multiplier 1e\\+29"),
+        ("1e-300", "0", "the multiplier 1e-300"),
+        ("1", "1e300", "the offset 1e\\+300"),
+        ("1", "-1e29", "the offset -1e\\+29"),
+    ],
+)
+def test_a_follower_that_no_mechanism_moves_so_is_refused(
+    multiplier: str, offset: str, found: str
+) -> None:
+    """Torques overflowed, and the logs were blamed."""
+    usual = f'multiplier="{MULTIPLIER}" offset="{OFFSET_RAD}"'
+    arm = _arm()
+    assert usual in arm
+    urdf = arm.replace(usual, f'multiplier="{multiplier}" offset="{offset}"')
+    with pytest.raises(ModelError, match=f"joint 'rod' mimics joint 'shoulder' with {found}"):
+        robot_from_urdf(urdf)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("axis", ["0 0 1e200", "1e308 1e308 0"])
+def test_an_axis_whose_length_overflows_is_refused_with_its_numbers(axis: str) -> None:
+    urdf = _arm().replace('<axis xyz="0 0 1"/>', f'<axis xyz="{axis}"/>')
+    with pytest.raises(ModelError, match=rf"<axis> of 'turn' .* xyz='{re.escape(axis)}'; expected"):
+        robot_from_urdf(urdf)
