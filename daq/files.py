@@ -54,14 +54,8 @@ def replace_file(
             old content is in place.
         WriteUnconfirmed: the fsync of the folder failed; the new content is in place.
     """
-    target = judge_target(path)
-    if target.is_dir():
-        raise IsADirectoryError(errno.EISDIR, "is a directory", str(path))
-    _require_unmarked(path, target)
-    model = like or (target if target.exists() else None)
-    # For the owner alone until it has the rights of the other file: an open descriptor outlives a
-    # later chmod.
-    temporary, descriptor = _new_file(target, 0o666 if model is None else 0o600)
+    target = _require_replaceable(path)
+    temporary, descriptor, model = _temporary_file(target, like)
     try:
         with os.fdopen(descriptor, "wb") as stream:
             if model is not None:
@@ -79,6 +73,70 @@ def replace_file(
         fsync_folder(target.parent)
     except OSError as error:
         raise WriteUnconfirmed.of(path, error) from error
+
+
+def try_replacing(path: Path, *, like: Path | None = None) -> None:
+    """Try whether `replace_file` could put a file at `path`:
+    its temporary file is made, gets its rights, and is removed.
+
+    Args:
+        path, like: as of `replace_file`.
+
+    Raises:
+        OSError: as `replace_file`, but for what only the content shows, such as a full disk.
+    """
+    target = _require_replaceable(path)
+    temporary, descriptor, model = _temporary_file(target, like)
+    try:
+        if model is not None:
+            _copy_rights(descriptor, model)
+    finally:
+        os.close(descriptor)
+        temporary.unlink()
+
+
+def require_takes_files(folder: Path) -> None:
+    """Refuse a folder in which this user can make no file; none is made.
+
+    Raises:
+        OSError: it is not there, or takes none; ``strerror`` gives the reason.
+    """
+    is_read_only = bool(os.statvfs(folder).f_flag & os.ST_RDONLY)
+    number = errno.EACCES
+    if is_read_only:
+        number = errno.EROFS
+    elif os.access(folder, os.W_OK | os.X_OK):
+        return
+    raise OSError(number, os.strerror(number), str(folder))
+
+
+def _require_replaceable(path: Path) -> Path:
+    """Resolve the name of a file to replace; refuse a folder, and what has a mark.
+
+    Raises:
+        OSError: as `replace_file`.
+    """
+    target = judge_target(path)
+    if target.is_dir():
+        raise IsADirectoryError(errno.EISDIR, "is a directory", str(path))
+    _require_unmarked(path, target)
+    return target
+
+
+def _temporary_file(target: Path, like: Path | None) -> tuple[Path, int, Path | None]:
+    """Make the temporary file of a replacement; return its name, its descriptor,
+    and the file whose rights it gets, None for the usual ones.
+    """
+    model = like
+    if model is None and target.exists():
+        model = target
+    # For the owner alone until it has the rights of the other file: an open descriptor outlives a
+    # later chmod.
+    mode = 0o600
+    if model is None:
+        mode = 0o666
+    temporary, descriptor = _new_file(target, mode)
+    return temporary, descriptor, model
 
 
 def _require_unmarked(path: Path, target: Path) -> None:

@@ -285,6 +285,7 @@ class StateRefused(NodeError):
         self.asked = asked
         self.found = found
         self.statusword = statusword
+        self.reported = reported
 
 
 class ParameterRefused(NodeError):
@@ -324,6 +325,7 @@ class DriveFault(NodeError):
         self.reason = reason
         self.statusword = statusword
         self.emcy_code = emcy_code
+        self.remedy = remedy
 
 
 class SampleLost(DriverError):
@@ -359,6 +361,7 @@ class SampleLost(DriverError):
         super().__init__(f"cycle {cycle}: {text}")
         self.cycle = cycle
         self.axes = axes
+        self.reported = tuple(reported)
 
 
 class MotionRefused(DriverError):

@@ -486,6 +486,7 @@ def _output_failed(error: OSError, json_wanted: bool) -> int:
     has_changed = bool(WRITTEN or CHANGED)
     if has_changed or not isinstance(error, BrokenPipeError):
         failed = OutputFailed.of(Path(str(error.filename or "standard output")), error)
+        failed.__cause__ = error
         if not error.filename:
             failed.expected = "an output that takes what is printed"
             if has_changed:

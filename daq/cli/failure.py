@@ -12,6 +12,7 @@ import json
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
@@ -21,6 +22,7 @@ from daq.advice import for_command_line
 from daq.errors import DaqError, ExitCode, exit_code
 from daq.report.text import break_lines, printable, spelled_bytes
 from drivers import errors as driver
+from drivers.profiles.cia402 import STATUS_FAULT, STATUS_FOLLOWING_ERROR
 from ident import errors as identification
 
 if TYPE_CHECKING:
@@ -140,6 +142,24 @@ ADVICE: dict[type[Exception], tuple[str, str]] = {
 
 The nearest base class of an error counts.
 """
+
+_NO_POWER = (
+    "axes that keep their supply and their power from the first SYNC to the last",
+    "check the drive's supply and the safety chain (STO, emergency stop, enable), then repeat "
+    "the command",
+)
+"""Of an axis that booted again, fell silent or lost its power, and reported neither error nor
+fault.
+"""
+_FAULT_WITHOUT_CODE = (
+    "axes without a fault from the first SYNC to the last",
+    "remove the cause; `drivegain scan CELL --reset-faults` names and resets the fault",
+)
+_ERROR_REPORTED = (
+    "axes that report no error",
+    "remove the cause of the error that it reported (`drivegain explain-emcy CODE` explains its "
+    "code), then repeat the command",
+)
 
 _CHECK_NODE = (
     "check the drive's supply, its wiring, and `node_id` and `drive` of the axis in the cell file"
@@ -334,6 +354,9 @@ def may_have_power(error: BaseException | None) -> str:
 
 def _parts(error: Exception, verb: str) -> tuple[str, str, str, str]:
     """Return subject, found, expected and remedy."""
+    of_process = _advice_for_process(error)
+    if of_process is not None:
+        return of_process
     if isinstance(error, DaqError | WITH_EVIDENCE):
         return error.subject, error.found, error.expected, error.remedy
     if isinstance(error, driver.BusError):
@@ -348,11 +371,73 @@ def _parts(error: Exception, verb: str) -> tuple[str, str, str, str]:
         if isinstance(error, driver.SetupRefused) and error.remedy:
             # The answer of the drive says more than the class of the error.
             return error.found, error.found, error.expected, error.remedy
-    expected, remedy = _advice(type(error), verb)
+    expected, remedy = _advice_for_evidence(error, verb) or _advice(type(error), verb)
     message = str(error)
     if verb == "demo":
         message = message.replace(RESET, "")
     return message, message, expected, remedy
+
+
+def _advice_for_process(error: Exception) -> tuple[str, str, str, str] | None:
+    """Return the parts of an error whose cause is this process, not the file or bus that it names;
+    None for any other.
+    """
+    number = _system_error_number(error)
+    subject = getattr(error, "subject", str(error))
+    if number in (errno.EMFILE, errno.ENFILE):
+        return (
+            subject,
+            "too many open files",
+            "room for another open file",
+            "close other programs, or raise the limit (`ulimit -n`), then repeat the command",
+        )
+    if number == errno.ENOENT and _is_current_folder_gone():
+        return (
+            subject,
+            "no current folder: the one that this shell is in was removed",
+            "a current folder that is there",
+            "change to another folder (`cd`), then repeat the command",
+        )
+    return None
+
+
+def _is_current_folder_gone() -> bool:
+    """Whether the folder that relative names begin in was removed."""
+    try:
+        Path.cwd()
+    except FileNotFoundError:
+        return True
+    return False
+
+
+def _advice_for_evidence(error: Exception, verb: str) -> tuple[str, str] | None:
+    """Return expected and remedy by what is known of an error of a drive;
+    None where its class says enough.
+    """
+    if verb == "demo":
+        return None
+    if isinstance(error, driver.SampleLost | driver.StateRefused):
+        if any(getattr(error, "reported", ())):
+            return _ERROR_REPORTED
+    elif isinstance(error, driver.DriveFault):
+        return _advice_for_fault(error, verb)
+    return None
+
+
+def _advice_for_fault(error: driver.DriveFault, verb: str) -> tuple[str, str] | None:
+    """Return expected and remedy of a fault that has no code of an EMCY; None for one with it."""
+    # An error without its fields is one of a library that was made by hand.
+    code = getattr(error, "emcy_code", None)
+    statusword = getattr(error, "statusword", None)
+    remedy = getattr(error, "remedy", "")
+    if code is not None:
+        return None
+    if remedy:
+        expected, _ = _advice(type(error), verb)
+        return expected, remedy
+    if statusword is not None and statusword & (STATUS_FAULT | STATUS_FOLLOWING_ERROR):
+        return _FAULT_WITHOUT_CODE
+    return _NO_POWER
 
 
 def _advice(kind: type[Exception], verb: str) -> tuple[str, str]:

@@ -16,7 +16,13 @@ from daq.documents.session_state import GuidedState
 from daq.errors import ConfigurationInconsistent, DaqError
 from daq.jobs import session as sessions
 from daq.jobs.acceptance import Accept
-from daq.jobs.context import SessionContext, Tools, before_motion, sessions_that_count
+from daq.jobs.context import (
+    SessionContext,
+    Tools,
+    before_motion,
+    nearest_folder,
+    sessions_that_count,
+)
 from daq.jobs.gain_target import target_of
 from daq.jobs.guided import (
     GuidedSettings,
@@ -238,12 +244,14 @@ def _payload_text(cell: Cell, name: str | None) -> str:
 
 
 def _ready_text(context: SessionContext) -> str:
-    folder = context.settings.folder
-    there = next(path for path in (folder, *folder.parents) if path.is_dir())
+    there = nearest_folder(context.settings.folder)
     tools = replace(context.tools, free=lambda _: context.tools.free(there))
     quiet = replace(context.journal, stream=StringIO())
     before_motion(replace(context, tools=tools, journal=quiet), take_over=False)
-    return "free space, history readable, robot released, drives as declared and without power"
+    return (
+        "free space, files that can be written, history readable, robot released, drives as "
+        "declared and without power"
+    )
 
 
 def _predicted_text(context: SessionContext, payload: str | None, block_s: float) -> str:

@@ -6,8 +6,8 @@ The last of them takes over the drives that a killed recorder has left with powe
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -15,13 +15,24 @@ from typing import Any, Protocol
 
 from daq.config.cell import Cell, MotionPolicy
 from daq.config.recalibration import PlannedRun, Recalibration
-from daq.errors import ConfigurationInconsistent, DiskSpaceShort, JobHeld, writing
+from daq.errors import (
+    ConfigurationInconsistent,
+    DiskSpaceShort,
+    FileImmutable,
+    JobHeld,
+    OutputFailed,
+    OwnerNotKept,
+    reason_of,
+    writing,
+)
+from daq.files import require_takes_files
 from daq.jobs.block_check import BlockFacts, look_at_block, look_at_geometry
 from daq.jobs.certificate import renew_certificate
 from daq.jobs.gain_target import GainTarget, NetworkMaker
 from daq.jobs.journal import Journal, Level
 from daq.jobs.operator import Operator
 from daq.jobs.session import Session, begun_until
+from daq.ledger.audit import try_append
 from daq.ledger.ledger import Ledger, read_history
 from daq.report.certificate import Certificate
 from daq.report.plan_preview import save_preview
@@ -33,6 +44,7 @@ from daq.workflow.plan import Plan, PlanGoal, TargetBox, plan
 from daq.workflow.record import Recorded, RecordingRequest, network_of, record
 from daq.workflow.safeguards import FreeBytes, agree, free_bytes
 from daq.workflow.validate import Validation, validate
+from daq.writeback.file_access import try_writing
 from daq.writeback.request import Request
 from daq.writeback.target import Proposal, Target, Written, apply, propose
 from drivers.canopen.network import CanopenNetwork, SignalBlocker
@@ -334,6 +346,7 @@ class SessionContext:
     journal: Journal  #: log of the session, labelled with session and stage
     began_s: float = 0.0  #: start on the monotonic clock [s]
     block_signals: SignalBlocker = nullcontext  #: keeps signals away while the axes are stopped
+    writes: bool = True  #: whether the gains may be written; a job may only propose them
 
     @property
     def who(self) -> str:
@@ -481,8 +494,69 @@ def _require_own_history(context: SessionContext) -> None:
         context.journal.say(Level.WARNING, "the cell may have been renamed", text=text)
 
 
+def nearest_folder(folder: Path) -> Path:
+    """Return a folder, or the nearest one above it that is there."""
+    folders = (folder, *folder.parents)
+    return next(path for path in folders if path.is_dir())
+
+
+def require_writable(context: SessionContext) -> None:
+    """Check that the session can write what it will write after the recordings:
+    its folder, the audit log, and the controller's file if it may write the gains.
+
+    What it makes to try that is removed again.
+
+    Raises:
+        OutputFailed, AuditUnusable, ControllerUnfit: it cannot; nothing has moved.
+    """
+    folder = context.settings.folder
+    with _tried(folder, "a folder for sessions that this user may write"):
+        require_takes_files(nearest_folder(folder))
+    audit = context.target.history.audit
+    with _tried(audit, "an audit log that this user may write"):
+        try_append(audit)
+    file = context.target.file
+    if file is not None and context.writes:
+        with _tried(file, "a controller's file that this session can replace"):
+            try_writing(file, context.tools.now())
+
+
+@contextmanager
+def _tried(place: Path, expected: str) -> Iterator[None]:
+    """Report a refusal of the file system in the block, before anything moves.
+
+    Raises:
+        OutputFailed: it refuses.
+    """
+    try:
+        yield
+    except OSError as error:
+        if isinstance(error, OwnerNotKept | FileImmutable):
+            refused = OutputFailed.of(place, error)
+            raise OutputFailed(
+                refused.subject,
+                found=refused.found,
+                expected=refused.expected,
+                remedy=f"nothing has moved; {refused.remedy}",
+            ) from error
+        missing = OutputFailed.of_missing_folder(place, error)
+        if missing is not None:
+            raise missing from error
+        found = reason_of(error)
+        refused_name = error.filename
+        if refused_name is not None and str(refused_name) != str(place):
+            found = f"{refused_name}: {found}"
+        raise OutputFailed(
+            str(place),
+            found=found,
+            expected=expected,
+            remedy="nothing has moved; give this user the right to make files there, or mount it "
+            "so that it can be written, then repeat the command",
+        ) from error
+
+
 def before_motion(context: SessionContext, *, take_over: bool = True) -> None:
-    """Check disk space, history, interlock and drives.
+    """Check disk space, places to write to, history, interlock and drives.
 
     Args:
         context: of the job.
@@ -492,7 +566,8 @@ def before_motion(context: SessionContext, *, take_over: bool = True) -> None:
     Raises:
         DiskSpaceShort, JobHeld, HistoryUnreadable, AuditUnusable, NotReleased, DriverError: nothing
             has moved.
-        OutputFailed: the session's folder is gone.
+        OutputFailed: the session's folder is gone; or as `require_writable`.
+        ControllerUnfit: as `require_writable`.
     """
     settings = context.settings
     tools = context.tools
@@ -506,8 +581,9 @@ def before_motion(context: SessionContext, *, take_over: bool = True) -> None:
             remedy="nothing has moved; free space, keep fewer sessions, or name a folder on "
             "another disk",
         )
-    # The gains are compared with it: what is wrong with it is better known now than after the
-    # recordings.
+    # What is wrong with it is better known now than after the recordings.
+    require_writable(context)
+    # The gains are compared with it.
     _require_own_history(context)
     release_check(context.cell, tools.now, tools.run)()
     context.journal.say(Level.INFO, "the interlock lets the robot move", free_mb=round(free_mb))

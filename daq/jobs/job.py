@@ -18,7 +18,15 @@ from daq.config.recalibration import Recalibration
 from daq.documents.session_state import Outcome
 from daq.errors import ExitCode, TimeBoundReached
 from daq.jobs import session as sessions
-from daq.jobs.context import SessionContext, Tools, before_motion, section_of, sessions_that_count
+from daq.jobs.context import (
+    SessionContext,
+    Tools,
+    before_motion,
+    nearest_folder,
+    require_writable,
+    section_of,
+    sessions_that_count,
+)
 from daq.jobs.gain_target import file_of
 from daq.jobs.journal import Journal, Level
 from daq.jobs.operator import CellPolicy
@@ -125,10 +133,11 @@ def preview(
             made = tuple(run.name for run in verified_runs(session).state.runs)
         left = [run for run in section.runs if run.name not in made]
         if left:
-            folders = (section.folder, *section.folder.parents)
-            folder = next((path for path in folders if path.is_dir()), section.folder)
+            folder = nearest_folder(section.folder)
             there = replace(tools, free=lambda _: tools.free(folder))
             before_motion(replace(context, tools=there), take_over=False)
+        else:
+            require_writable(context)
     steps = []
     if left and section.warm_up_min:
         steps = [f"warm up for {section.warm_up_min:g} min"]
@@ -151,16 +160,18 @@ def _context(
 ) -> SessionContext:
     """What the stages share in a job: the runs of the cell file, and its policy as the operator."""
     section = section_of(cell)
+    policy = CellPolicy(cell, section, who, tools.run)
     return SessionContext(
         cell_file,
         cell,
         section,
         FixedRuns(section.runs),
-        CellPolicy(cell, section, who, tools.run),
+        policy,
         file_of(cell),
         tools,
         journal,
         began_s=tools.monotonic_s(),
+        writes=policy.writes,
     )
 
 

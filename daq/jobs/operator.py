@@ -84,6 +84,13 @@ class CellPolicy:
         """Whether `policy` allows unguarded axes."""
         return self.cell.unguarded is Permission.ALLOWED
 
+    @property
+    def writes(self) -> bool:
+        """Whether the job may write gains; else it only proposes them."""
+        is_of_job = self.cell.apply.by is AppliedBy.JOB
+        has_drives = self.cell.controller is not None and bool(self.cell.controller.objects)
+        return is_of_job and not has_drives
+
     def mount(self, run: PlannedRun) -> None:
         """Run the mount command with the payload's name.
 
@@ -125,9 +132,7 @@ class CellPolicy:
         """Whether `policy: {apply: {by: job}}` lets the job write;
         what an operator changed since is left to one.
         """
-        is_of_job = self.cell.apply.by is AppliedBy.JOB
-        has_drives = self.cell.controller is not None and bool(self.cell.controller.objects)
-        return is_of_job and not has_drives and not touched
+        return self.writes and not touched
 
 
 @dataclass(frozen=True, slots=True)

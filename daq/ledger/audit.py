@@ -27,7 +27,15 @@ from enum import Enum
 from pathlib import Path
 
 from daq.errors import AuditUnusable, WriteUnconfirmed, counted, reason_of
-from daq.files import follow_links, fsync_folder, is_marked, read_regular, sha256, sha256_of
+from daq.files import (
+    follow_links,
+    fsync_folder,
+    is_marked,
+    read_regular,
+    require_takes_files,
+    sha256,
+    sha256_of,
+)
 
 _LOG = logging.getLogger("drivegain")
 MAX_BYTES = 2**30  #: Largest audit log; it is read whole
@@ -254,6 +262,22 @@ def append(
             if is_first and not is_noted:
                 _LOG.warning("%s", _says_not_noted(path, error))
         return new
+
+
+def try_append(path: Path) -> None:
+    """Try whether an entry could be appended to an audit log; nothing is written.
+
+    Raises:
+        AuditUnusable: as `append`, but for its last line.
+        OSError: from the file system.
+    """
+    _require_target(path)
+    target = follow_links(path)
+    if not target.exists():
+        require_takes_files(target.parent)
+        return
+    with _locked(path):
+        pass
 
 
 def _write_all(descriptor: int, data: bytes, path: Path) -> None:

@@ -8,7 +8,8 @@ from pathlib import Path
 
 from daq.config.cell import Cell, WeighedPayload
 from daq.config.cell_file import URDF
-from daq.errors import DiskSpaceShort, UsageError, writing
+from daq.errors import DiskSpaceShort, OutputFailed, UsageError, writing
+from daq.log.container import UNFINISHED
 from daq.log.message import currents_bytes, joint_state_bytes, joint_state_prefix, sample_dtype
 from daq.log.writer import JOINT_STATE_NS
 from ident.model.bodies import Payload
@@ -78,6 +79,17 @@ class DiskRoom:
             DiskSpaceShort: the reserve is all that is left.
             OutputFailed: the folder has gone.
         """
+        folder = self._log.parent
+        if not folder.exists():
+            part = self._log.name + UNFINISHED
+            raise OutputFailed(
+                str(self._log),
+                found=f"no folder {folder} any more: it was moved or removed during the recording",
+                expected="the folder of a log in its place for as long as it is written",
+                remedy=f"the axes were sent a stop; what was recorded until then is {part} in the "
+                "folder under its new name (`drivegain salvage` saves it), and is lost if the "
+                "folder was removed: move the folder back, then record again",
+            )
         self._require(
             RESERVE_BYTES,
             f"{_megabytes(RESERVE_BYTES)} in reserve",

@@ -26,7 +26,14 @@ from daq.errors import (
     WriteUnconfirmed,
     reason_of,
 )
-from daq.files import follow_links, hold_lock, open_folder, replace_file, target_of_copy
+from daq.files import (
+    follow_links,
+    hold_lock,
+    open_folder,
+    replace_file,
+    target_of_copy,
+    try_replacing,
+)
 from daq.formats.document import read_controller_file
 from daq.writeback.request import short_digest
 
@@ -115,7 +122,7 @@ def exclusive_writer(target: Path) -> Iterator[None]:
         CalibrationRefused: another drivegain writes it.
         OutputFailed: the lock file cannot be made, or something else has its name.
     """
-    lock = target.parent / f".{target.name}.lock"
+    lock = _lock_of(target)
     with contextlib.ExitStack() as stack:
         try:
             stack.enter_context(hold_lock(lock))
@@ -137,6 +144,35 @@ def exclusive_writer(target: Path) -> Iterator[None]:
             ) from error
         _remove_unfinished(target)
         yield
+
+
+def _lock_of(target: Path) -> Path:
+    """Return the lock file of a controller's file."""
+    return target.parent / f".{target.name}.lock"
+
+
+def try_writing(file: Path, now: datetime) -> None:
+    """Try whether a write of a controller's file could make its files: lock, backup, new content.
+
+    Each of them is made empty and removed again; the controller's file is only read.
+
+    Args:
+        file: as it was declared.
+        now: time, for the name of the backup.
+
+    Raises:
+        ControllerUnfit: see `resolve_links` and `require_existing`; or it cannot be read.
+        OSError: from the file system; its ``filename`` is that of the file that cannot be made.
+    """
+    require_existing(file)
+    target = resolve_links(file)
+    content = read_controller_file(target)
+    # Another writer has the lock: it is there, and free again in a moment.
+    with contextlib.suppress(BlockingIOError), hold_lock(_lock_of(target)):
+        pass
+    # The digest of the new content is not known yet; a name has the same length with any.
+    try_replacing(_new_backup(target, content, content, now), like=target)
+    try_replacing(target)
 
 
 def _remove_unfinished(target: Path) -> None:
@@ -245,11 +281,7 @@ def back_up(target: Path, before: bytes, after: bytes, now: datetime) -> Path:
     Raises:
         OSError: from the file system; no backup is left.
     """
-    taken = [(backup.stamp, backup.count) for backup in backups(target)]
-    order = next_order(taken, now)
-    before_digest = short_digest(before)
-    after_digest = short_digest(after)
-    backup = target.with_name(f"{target.name}.{order}.{before_digest}-{after_digest}.bak")
+    backup = _new_backup(target, before, after, now)
     # No file has this name: the lock excludes other processes of drivegain, and time and count are
     # beyond every backup.
     try:
@@ -261,6 +293,15 @@ def back_up(target: Path, before: bytes, after: bytes, now: datetime) -> Path:
             raise OSError(error.errno, error.strerror, str(backup)) from error
         raise
     return backup
+
+
+def _new_backup(target: Path, before: bytes, after: bytes, now: datetime) -> Path:
+    """Return the name of the next backup of a controller file; as `back_up`."""
+    taken = [(backup.stamp, backup.count) for backup in backups(target)]
+    order = next_order(taken, now)
+    before_digest = short_digest(before)
+    after_digest = short_digest(after)
+    return target.with_name(f"{target.name}.{order}.{before_digest}-{after_digest}.bak")
 
 
 def next_order(taken: Sequence[tuple[str, int]], now: datetime) -> str:

@@ -17,11 +17,11 @@ from typing import Any
 import pytest
 
 from daq.cli.failure import ADVICE, ADVICE_WITHIN, ErrorParts, show_failure
-from daq.errors import DataError, ExitCode, OutputFailed
+from daq.errors import DataError, ExitCode, OutputFailed, UsageError
 from daq.report.document import ErrorReport, json_tree
 from drivers.canopen.bus import bus_errors
 from drivers.canopen.emcy import remedy_of
-from drivers.errors import BusError, DriveFault, DriverError
+from drivers.errors import BusError, DriveFault, DriverError, SampleLost
 from ident.errors import IdentificationError
 from tests.daq.command_line import run_verb
 
@@ -236,3 +236,65 @@ def test_an_interrupt_says_what_was_kept_and_leaves_no_empty_folder(
         assert capsys.readouterr().err.endswith("interrupted: no file was written\n")
         assert folder.exists() is stays
     assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize(
+    ("statusword", "remedy"),
+    [(None, "safety chain"), (0x0240, "safety chain"), (0x0218, "--reset-faults")],
+)
+def test_remedy_of_a_fault_without_a_code_explains_none(
+    statusword: int | None, remedy: str
+) -> None:
+    fault = DriveFault(3, "left OPERATIONAL, is BOOT-UP", statusword)
+    failure = ErrorParts.of(fault, "record")
+    assert remedy in failure.do
+    assert "explain-emcy" not in failure.do
+
+
+def test_remedy_of_a_fault_with_a_code_explains_it() -> None:
+    failure = ErrorParts.of(DriveFault(3, "EMCY 8611h", emcy_code=0x8611), "record")
+    assert "explain-emcy" in failure.do
+
+
+def test_remedy_of_a_fault_that_has_its_own_is_that_one() -> None:
+    failure = ErrorParts.of(DriveFault(3, "a limit", 0x0237, remedy="use slower moves"), "record")
+    assert failure.do == "use slower moves"
+
+
+def test_remedy_of_a_lost_sample_after_an_error_is_about_that_error() -> None:
+    reported = ("EMCY 8130h heartbeat error",)
+    lost = SampleLost(0, (2,), ("J3",), reported=reported)
+    assert "explain-emcy" in ErrorParts.of(lost, "record").do
+    silent = SampleLost(0, (2,), ("J3",), reported=("",))
+    assert "load of bus" in ErrorParts.of(silent, "record").do
+
+
+@pytest.mark.parametrize("number", [errno.EMFILE, errno.ENFILE])
+def test_too_many_open_files_names_the_limit(number: int) -> None:
+    error = UsageError("cell.yaml", found="x", expected="y", remedy="check the name")
+    error.__cause__ = OSError(number, os.strerror(number), "cell.yaml")
+    failure = ErrorParts.of(error)
+    assert failure.found == "too many open files"
+    assert "ulimit -n" in failure.do
+
+
+@pytest.mark.parametrize(
+    "words", [("fit", "a.mcap", "--out", "c.yaml"), ("init", "press-4", "--simulated")]
+)
+def test_a_removed_current_folder_is_named(
+    words: tuple[str, ...],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    folder = tmp_path / "gone"
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    folder.rmdir()
+    try:
+        assert run_verb(*words) != ExitCode.OK
+    finally:
+        os.chdir(tmp_path)
+    said = capsys.readouterr().err
+    assert "no current folder" in said
+    assert "change to another folder" in said

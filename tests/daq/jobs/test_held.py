@@ -4,14 +4,15 @@ the next job takes it up.
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import select
 import signal
 import socket
 import tracemalloc
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, replace
 from datetime import timedelta
 from pathlib import Path
@@ -25,6 +26,7 @@ from daq.config.recalibration import Command, Interlock
 from daq.config.same_cell import calibrated_robot
 from daq.documents.session_state import Outcome
 from daq.errors import (
+    AuditUnusable,
     BusTaken,
     ConfigurationInconsistent,
     ControllerUnfit,
@@ -860,3 +862,76 @@ def test_a_link_that_no_write_would_follow_is_refused_before_anything_is_recorde
     with pytest.raises(ControllerUnfit, match="everybody may write"):
         rig.job()
     assert rig.sessions == ()
+
+
+def made_folder(parent: Path) -> Path:
+    """A new folder for a cell."""
+    folder = parent / "cell"
+    folder.mkdir()
+    return folder
+
+
+@contextmanager
+def refusing_new_files(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """No file can be made in a folder, as on a disk that is mounted read-only, by root too."""
+    really_open = os.open
+
+    def refusing_open(path: Any, flags: int, *further: Any, **named: Any) -> int:
+        if flags & os.O_CREAT and Path(os.fsdecode(path)).parent == folder:
+            raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(path))
+        return really_open(path, flags, *further, **named)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "open", refusing_open)
+        yield
+
+
+def test_preflight_a_controllers_folder_that_is_read_only_holds_a_job_that_writes(
+    tmp_path: Path, short_plan: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig = make_rig(made_folder(tmp_path), short_plan)
+    asked_drives = without_drives(rig)
+    with refusing_new_files(rig.controller.parent, monkeypatch):
+        refused = held(rig, OutputFailed, ExitCode.UNEXPECTED)
+    assert "read-only file system" in str(refused)
+    assert "nothing has moved" in str(refused)
+    assert asked_drives == []
+
+
+def test_preflight_a_job_that_only_proposes_needs_no_place_in_the_controllers_folder(
+    tmp_path: Path, short_plan: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig = make_rig(made_folder(tmp_path), short_plan, policy={"motion": "allowed"})
+    without_drives(rig)
+    journal = Journal(rig.said, Form.JSON, lambda: rig.clock.at)
+    with refusing_new_files(rig.controller.parent, monkeypatch):
+        seen = preview(
+            rig.cell_file, rig.cell, rig.tools, journal, who="a person", lock_folder=rig.folder
+        )
+    assert "write, approved by: person" in seen.steps
+
+
+@pytest.mark.parametrize("taken", ["controllers/.demo.yaml.lock", "cells/demo.audit.jsonl"])
+def test_dry_run_a_folder_in_place_of_a_file_to_write_refuses(
+    tmp_path: Path, short_plan: Path, taken: str
+) -> None:
+    rig = make_rig(made_folder(tmp_path), short_plan)
+    without_drives(rig)
+    (rig.folder / taken).mkdir()
+    before = sorted(rig.folder.rglob("*"))
+    journal = Journal(rig.said, Form.JSON, lambda: rig.clock.at)
+    with pytest.raises((OutputFailed, AuditUnusable)) as refused:
+        preview(rig.cell_file, rig.cell, rig.tools, journal, who="a person", lock_folder=rig.folder)
+    assert Path(taken).name in str(refused.value)
+    assert sorted(rig.folder.rglob("*")) == before
+
+
+def test_dry_run_with_places_to_write_leaves_nothing_behind(
+    tmp_path: Path, short_plan: Path
+) -> None:
+    rig = make_rig(made_folder(tmp_path), short_plan)
+    without_drives(rig)
+    before = sorted(rig.folder.rglob("*"))
+    journal = Journal(rig.said, Form.JSON, lambda: rig.clock.at)
+    preview(rig.cell_file, rig.cell, rig.tools, journal, who="a person", lock_folder=rig.folder)
+    assert sorted(rig.folder.rglob("*")) == before

@@ -145,3 +145,16 @@ def test_a_disk_that_is_full_all_at_once_stops_the_axes_too(
     assert {decode(node.statusword) for node in rig.bus.nodes} <= set(POWERLESS)
     assert rig.out.with_name("a.mcap.part").exists()
     assert not rig.out.exists()
+
+
+def test_check_of_a_folder_that_was_moved_says_where_the_recording_may_be(tmp_path: Path) -> None:
+    folder = tmp_path / "sessions"
+    folder.mkdir()
+    room = DiskRoom(folder / "bare.mcap", lambda _: 10**12)
+    room.check()
+    folder.rename(tmp_path / "elsewhere")
+    with pytest.raises(OutputFailed) as refused:
+        room.check()
+    assert "moved or removed" in refused.value.found
+    assert "bare.mcap.part" in refused.value.remedy
+    assert "nothing was written" not in refused.value.remedy
