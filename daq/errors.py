@@ -93,7 +93,7 @@ def counted(count: int, noun: str) -> str:
     return f"{count} {noun}s"
 
 
-def printable(text: str) -> str:
+def on_one_line(text: str) -> str:
     """Return a text of a file for one line of a message: with its control characters and line ends
     escaped.
     """

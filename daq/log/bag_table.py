@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from daq.config.import_description import Column, ImportDescription, KeptPart, TimeColumn, TimeUnit
-from daq.errors import TableUnfit, counted, printable
+from daq.errors import TableUnfit, counted, on_one_line
 from daq.files import read_regular
 from daq.log.bag_file import open_bag
 from daq.log.mcap_bag import JointState, Topic, joint_state_from_cdr, unpack_message
@@ -167,10 +167,10 @@ def _require_one_topic(path: Path, source: _ColumnSource, topics: dict[str, bool
         found = "no message"
         remedy = "is this the right bag?"
         if topics:
-            listed = ", ".join(map(printable, topics))
+            listed = ", ".join(map(on_one_line, topics))
             found = f"topics {listed}"
         if of_joints and source.topic is not None:
-            listed = ", ".join(map(printable, of_joints))
+            listed = ", ".join(map(on_one_line, of_joints))
             remedy = f"correct `topic` in the import description; joint states are on {listed}"
         sought = source.topic or "a topic"
         expected = f"{sought} of type {JOINTS_SCHEMA}"
@@ -180,7 +180,7 @@ def _require_one_topic(path: Path, source: _ColumnSource, topics: dict[str, bool
             "choose one in the import description: `topic: NAME`; where positions and efforts are "
             "on different ones, `topic` under `position` and `current`"
         )
-        listed = ", ".join(map(printable, used))
+        listed = ", ".join(map(on_one_line, used))
         found = f"joint states on {len(used)} topics, {listed}"
         raise _unfit(path, found, "one topic", remedy)
 
@@ -402,10 +402,10 @@ class _Publisher:
             frame = "without a header"
         else:
             frame = f"frame {self.frame!r}"
-        joints = ", ".join(map(printable, sorted(self.joints)))
+        joints = ", ".join(map(on_one_line, sorted(self.joints)))
         node = ""
         if self.node:
-            node = f"{printable(self.node)}, "
+            node = f"{on_one_line(self.node)}, "
         if self.channel > 1:
             node += f"channel {self.channel}, "
         messages = counted(self.messages, "message")
@@ -475,7 +475,7 @@ class _Rows:
                 twice = next(name for name in state.names if state.names.count(name) > 1)
                 raise _unfit(
                     self._path,
-                    f"joint {printable(twice)} twice in one message",
+                    f"joint {on_one_line(twice)} twice in one message",
                     "each joint once",
                     "mend its publisher",
                 )
@@ -768,7 +768,7 @@ class _Rows:
             found: set[str] = set()
             for names in self._places:
                 found.update(names)
-            joints = ", ".join(map(printable, sorted(found))) or "none"
+            joints = ", ".join(map(on_one_line, sorted(found))) or "none"
             raise _unfit(self._path, f"joints {joints}", f"those of {absent}")
         empty = _listed(columns, np.asarray(~is_number.any(axis=0)))
         if empty:
@@ -915,7 +915,7 @@ def _share_near(steps_s: FloatArray, usual_s: float) -> float:
 
 def _listed(columns: tuple[Column, ...], is_listed: BoolArray) -> str:
     """Name some of the columns; empty without any."""
-    return ", ".join(printable(str(columns[number])) for number in np.flatnonzero(is_listed))
+    return ", ".join(on_one_line(str(columns[number])) for number in np.flatnonzero(is_listed))
 
 
 def _require_possible(time_ns: int) -> None:

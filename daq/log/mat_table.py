@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daq.config.import_description import Column, ImportDescription, TimeColumn, TimeUnit
-from daq.errors import TableUnfit, counted, first_few, printable
+from daq.errors import TableUnfit, counted, first_few, on_one_line
 from daq.files import read_regular
 from daq.log.table import (
     MIDNIGHT,
@@ -409,5 +409,5 @@ def _text(data: memoryview) -> str:
 
 def _listed(arrays: dict[str, _Array], before: str = "") -> str:
     """Name up to twelve arrays with their sizes."""
-    names = [f"{before}{printable(name)} ({array})" for name, array in arrays.items()]
+    names = [f"{before}{on_one_line(name)} ({array})" for name, array in arrays.items()]
     return first_few(names, 12, separator=", ") or "none"

@@ -16,7 +16,7 @@ import zstandard
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Chunk, Header, McapRecord, Message, Metadata, Schema
 
-from daq.errors import LogForeign, LogTruncated, LogUnreadable, printable
+from daq.errors import LogForeign, LogTruncated, LogUnreadable, on_one_line
 from daq.log.container import HEAD_BYTES, LARGEST_RATIO, PlacedRecord, RecordFile
 from daq.log.message import JOINTS_SCHEMA, SAMPLES_TOPIC
 
@@ -244,11 +244,11 @@ def foreign_recording(path: Path) -> LogForeign | None:
             return None
         return _without_message(path, bag.library, is_finished=is_finished)
     states = [topic for topic, has in topics.items() if has]
-    library = printable(bag.library) or "another program"
-    content = ", ".join(map(printable, topics))
+    library = on_one_line(bag.library) or "another program"
+    content = ", ".join(map(on_one_line, topics))
     if states:
-        joints_listed = ", ".join(map(printable, joints)) or "no joint"
-        topics_listed = ", ".join(map(printable, states))
+        joints_listed = ", ".join(map(on_one_line, joints)) or "no joint"
+        topics_listed = ", ".join(map(on_one_line, states))
         content = f"joint states of {joints_listed} on {topics_listed}"
     found = f"a bag of {library} with {content}"
     remedy = f"`drivegain import` reads bags with {JOINTS_SCHEMA}"
@@ -273,7 +273,7 @@ def _without_message(path: Path, library: str, *, is_finished: bool) -> LogForei
     """
     if not library or library.startswith(OWN_LIBRARY):
         return None
-    library = printable(library)
+    library = on_one_line(library)
     if is_finished:
         return LogForeign(
             str(path),
