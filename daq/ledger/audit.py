@@ -358,7 +358,7 @@ def _note_head(path: Path, content: bytes, head: str) -> None:
     Raises:
         OSError: the note cannot be written.
     """
-    missing = [one for one in noted_heads(path) if one.encode() not in content]
+    missing = [one for one in noted_heads(path) if not _has_entry(content, one)]
     noted = "".join(f"{one}\n" for one in (*missing, head)).encode()
     descriptor = _open_note(path, os.O_CREAT)
     try:
@@ -367,6 +367,23 @@ def _note_head(path: Path, content: bytes, head: str) -> None:
         _replace_in_place(descriptor, noted)
     finally:
         os.close(descriptor)
+
+
+def _has_entry(content: bytes, digest: str) -> bool:
+    """Whether there is a complete entry of a digest; the beginning of one can have it, too."""
+    mark = _mark_of(digest)
+    for line in _lines_of(content):
+        if mark not in line:
+            continue
+        one, _ = _decode(line)
+        if one is not None and one.sha256 == digest:
+            return True
+    return False
+
+
+def _mark_of(digest: str) -> bytes:
+    """Return the part of a line that has its digest."""
+    return _DIGEST + digest.encode() + b'"'
 
 
 def _replace_in_place(descriptor: int, lines: bytes) -> None:
@@ -530,6 +547,10 @@ class Flaw(Enum):
     MOVED = "moved"
     ADDED = "added"
     CUT_OFF = "cut off"
+    UNFINISHED = "unfinished"  #: The entry was complete when it was noted; its end is lost
+
+
+_LOST = frozenset({Flaw.CUT_OFF, Flaw.UNFINISHED})  #: An entry that was noted is missing
 
 
 @dataclass(frozen=True, slots=True)
@@ -566,7 +587,9 @@ class AuditVerdict:
     entries: tuple[AuditEntry, ...]  #: all of them, in the order of the file
     intact: tuple[AuditEntry, ...]  #: those whose digest is that of their content
     flaws: tuple[AuditFlaw, ...]  #: by their lines; empty for an intact chain
-    torn: tuple[int, ...]  #: lines, from 1, that a killed writer left unfinished; they are no flaw
+    #: Lines, from 1, that a killed writer left unfinished. They are no flaw, but where an entry is
+    #: missing, one of them may be what is left of it.
+    torn: tuple[int, ...]
     open_writes: tuple[OpenWrite, ...]  #: begun and not ended
 
     @property
@@ -575,6 +598,20 @@ class AuditVerdict:
         as far as a chain can show it.
         """
         return not self.flaws
+
+    @property
+    def lacks_noted(self) -> bool:
+        """Whether an entry that was noted elsewhere is missing."""
+        return any(flaw.flaw in _LOST for flaw in self.flaws)
+
+    @property
+    def is_torn_end(self) -> bool:
+        """Whether an unfinished line, with a noted entry missing, is all that is wrong: a disk that
+        lost the last bytes leaves that, and so does a person who cuts them off.
+        """
+        kinds = {flaw.flaw for flaw in self.flaws}
+        has_remains = Flaw.UNFINISHED in kinds or bool(self.torn)
+        return bool(kinds) and kinds <= _LOST and has_remains
 
     @property
     def broken(self) -> int | None:
@@ -602,11 +639,7 @@ def judge_chain(
             chain.take(index, one, holds=holds)
     chain.settle(None)
     entries = tuple(one for one, _ in chain.decoded if one is not None)
-    unknown = sorted(set(heads) - {one.sha256 for one in entries})
-    if unknown:
-        digests = ", ".join(digest[:12] for digest in unknown)
-        says = f"{counted(len(unknown), 'entry')} noted elsewhere and missing here: {digests}"
-        chain.flaws.append(AuditFlaw(len(chain.lines) + 1, Flaw.CUT_OFF, says))
+    chain.find_missing(set(heads) - {one.sha256 for one in entries})
     flaws = tuple(sorted(chain.flaws, key=lambda flaw: flaw.line))
     return AuditVerdict(
         entries=entries,
@@ -710,6 +743,30 @@ class _Chain:
                 self.number += len(fragments)
                 self.previous = None
         self.unfinished = []
+
+    def find_missing(self, digests: Collection[str]) -> None:
+        """Report entries that were noted elsewhere and are missing, at what is left of them."""
+        missing = []
+        for digest in sorted(digests):
+            place = self._beginning_of(digest)
+            if place is None:
+                missing.append(digest[:12])
+                continue
+            self.torn.remove(place)
+            says = f"the beginning of an entry noted elsewhere ({digest[:12]}), whose end is lost"
+            self._add_flaw(place, Flaw.UNFINISHED, says)
+        if missing:
+            count = counted(len(missing), "entry")
+            says = f"{count} noted elsewhere and missing here: {', '.join(missing)}"
+            self._add_flaw(len(self.lines) + 1, Flaw.CUT_OFF, says)
+
+    def _beginning_of(self, digest: str) -> int | None:
+        """Return the unfinished line that has the digest of its entry; None where there is none."""
+        mark = _mark_of(digest)
+        for place in self.torn:
+            if mark in self.lines[place - 1]:
+                return place
+        return None
 
     def _add_flaw(self, line: int, flaw: Flaw, says: str) -> None:
         self.flaws.append(AuditFlaw(line, flaw, says))
