@@ -11,6 +11,7 @@ end, or all of it, is missing. docs/decisions/0036 says what this defends agains
 
 from __future__ import annotations
 
+import codecs
 import contextlib
 import errno
 import fcntl
@@ -42,6 +43,12 @@ _BEGINNING = b'{"action":"'  #: Begin of every line: the keys are sorted
 #: Before the digest of a line; in a text of it, the quotation marks would be escaped
 _DIGEST = b',"sha256":"'
 _DIGITS = 64  #: Of a digest, hexadecimal
+CONVERT_BACK = (
+    "keep a copy, convert the file back to UTF-8 without a BOM and with line ends LF "
+    "(`dos2unix FILE`), check it with `drivegain history CELL --verify`, and end what converts it, "
+    "such as an editor, or git (`*.jsonl -text` in .gitattributes)"
+)
+"""What to do about an audit log that another program has converted."""
 
 
 class AuditAction(Enum):
@@ -440,6 +447,14 @@ def _end_of(content: bytes, path: Path) -> tuple[AuditEntry | None, list[bytes]]
         if one is not None and holds:
             return one, unfinished[::-1]
         if one is not None or not _is_fragment(line):
+            _, conversion = _unconverted(content)
+            if conversion:
+                raise AuditUnusable(
+                    str(path),
+                    found=f"{conversion}, by another program",
+                    expected="an audit log as drivegain writes it",
+                    remedy=f"{CONVERT_BACK}; nothing was written",
+                )
             raise AuditUnusable(
                 str(path),
                 found=f"line {number}, which drivegain did not write",
@@ -450,6 +465,31 @@ def _end_of(content: bytes, path: Path) -> tuple[AuditEntry | None, list[bytes]]
             )
         unfinished.append(line)
     return None, unfinished[::-1]
+
+
+def _unconverted(content: bytes) -> tuple[bytes, str]:
+    """Return an audit log without what another program has converted, and what that was in words;
+    the content as it is, and no words, where it was not converted.
+
+    No entry has a carriage return or a BOM: its text is escaped.
+    """
+    text = content
+    conversions = []
+    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        with contextlib.suppress(UnicodeError):
+            text = content.decode("utf-16").encode()
+            conversions.append("its encoding was converted (UTF-16)")
+    elif content.startswith(codecs.BOM_UTF8):
+        text = content.removeprefix(codecs.BOM_UTF8)
+        conversions.append("its encoding was converted (UTF-8 with a BOM)")
+    line_ends = text.count(b"\n")
+    if line_ends > 0 and text.count(b"\r\n") == line_ends:
+        text = text.replace(b"\r\n", b"\n")
+        conversions.append("its line ends were converted (CRLF)")
+    has_entries = bool(conversions) and any(_decode(line)[1] for line in _lines_of(text))
+    if not has_entries:
+        return content, ""
+    return text, " and ".join(conversions)
 
 
 @contextlib.contextmanager
@@ -547,6 +587,7 @@ class Flaw(Enum):
     MOVED = "moved"
     ADDED = "added"
     CUT_OFF = "cut off"
+    CONVERTED = "converted"  #: The whole file, by another program; its entries are judged without
     UNFINISHED = "unfinished"  #: The entry was complete when it was noted; its end is lost
 
 
@@ -605,6 +646,11 @@ class AuditVerdict:
         return any(flaw.flaw in _LOST for flaw in self.flaws)
 
     @property
+    def is_only_converted(self) -> bool:
+        """Whether the entries are what was written, in a file that was converted."""
+        return [flaw.flaw for flaw in self.flaws] == [Flaw.CONVERTED]
+
+    @property
     def is_torn_end(self) -> bool:
         """Whether an unfinished line, with a noted entry missing, is all that is wrong: a disk that
         lost the last bytes leaves that, and so does a person who cuts them off.
@@ -631,7 +677,8 @@ def judge_chain(
         heads: digests of entries that were noted elsewhere. One that is not in the chain shows that
             its end is missing.
     """
-    chain = _Chain(content)
+    text, conversion = _unconverted(content)
+    chain = _Chain(text)
     for index, (one, holds) in enumerate(chain.decoded):
         if one is None:
             chain.unfinished.append(index)
@@ -640,6 +687,8 @@ def judge_chain(
     chain.settle(None)
     entries = tuple(one for one, _ in chain.decoded if one is not None)
     chain.find_missing(set(heads) - {one.sha256 for one in entries})
+    if conversion:
+        chain.flaws.append(AuditFlaw(1, Flaw.CONVERTED, conversion))
     flaws = tuple(sorted(chain.flaws, key=lambda flaw: flaw.line))
     return AuditVerdict(
         entries=entries,

@@ -31,6 +31,7 @@ from daq.errors import (
 )
 from daq.files import fsync_folder
 from daq.ledger.audit import (
+    CONVERT_BACK,
     AuditAction,
     AuditEntry,
     AuditVerdict,
@@ -570,6 +571,8 @@ def _remedy(verdict: AuditVerdict, note: str) -> str:
         verdict: on it.
         note: on the digests that were noted next to it, in brackets.
     """
+    if verdict.is_only_converted:
+        return f"the entries are what was written: {CONVERT_BACK}"
     if verdict.is_torn_end:
         return (
             "keep a copy, and restore the missing entry, with the `.head`, from a backup"
