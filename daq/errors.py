@@ -25,6 +25,7 @@ from __future__ import annotations
 
 import errno
 import shlex
+import stat
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from enum import IntEnum
@@ -351,7 +352,8 @@ class OutputFailed(DaqError):
                 found=reason_of(error),
                 expected="a user who may keep owner and group of the file, so that who reads it "
                 "now can read it then",
-                remedy="it is as it was; run the command as its owner and in its group (`sudo -u`, "
+                remedy=f"{_state_after(path)}; "
+                "run the command as its owner and in its group (`sudo -u`, "
                 "or `usermod -aG` and a new login), or give the file to this user (`chown`, "
                 "`chgrp`) if the controller can read it then",
             )
@@ -360,7 +362,7 @@ class OutputFailed(DaqError):
                 str(path),
                 found=error.reason,
                 expected="a file that may be replaced",
-                remedy="it is as it was; ask who set the mark and why, take it off "
+                remedy=f"{_state_after(path)}; ask who set the mark and why, take it off "
                 f"(`chattr -i -a {shlex.quote(str(error.marked))}`), then repeat the command",
             )
         missing = cls.of_missing_folder(path, error)
@@ -372,13 +374,13 @@ class OutputFailed(DaqError):
                 found=reason_of(error),
                 expected="a name that the file system takes, with the endings of its temporary "
                 "files",
-                remedy="it is as it was; choose a shorter name",
+                remedy=f"{_state_after(path)}; choose a shorter name",
             )
         return cls(
             str(path),
             found=reason_of(error),
             expected="a folder that can be written, with room",
-            remedy="it is as it was; free space or rights, or choose another folder",
+            remedy=f"{_state_after(path)}; free space or rights, or choose another folder",
         )
 
     @classmethod
@@ -404,6 +406,21 @@ class OutputFailed(DaqError):
             expected="a folder that is there",
             remedy="nothing was written; make it (`mkdir -p`), or choose another folder",
         )
+
+
+def _state_after(path: Path) -> str:
+    """Say what a file is that was not written: one that never existed is not as it was."""
+    try:
+        found = path.stat()
+    except FileNotFoundError:
+        return "it was not made"
+    except OSError as error:
+        if error.errno == errno.ENAMETOOLONG:
+            return "it was not made"
+        return "it is as it was"
+    if stat.S_ISREG(found.st_mode) and found.st_size == 0:
+        return "it is empty"
+    return "it is as it was"
 
 
 def reason_of(error: OSError) -> str:

@@ -157,7 +157,8 @@ def history_verb(
         _rename(ledger, cell, rename, sessions, who, now, confirmed=yes)
     if add is not None:
         _add(ledger, add, who, now)
-    checked, history, all_series = _read(ledger, verify)
+    needed = (acknowledge, axis)
+    checked, history, all_series = _read(ledger, verify, needed, is_drawn=plot is not None)
     if acknowledge is not None:
         _acknowledge(ledger, _named(all_series, acknowledge, declared), who, why, since, now)
         checked, history, all_series = _read(ledger, verify)
@@ -226,14 +227,55 @@ def _require_log(ledger: Ledger, checked: Verification) -> None:
         )
 
 
-def _read(ledger: Ledger, verify: bool) -> tuple[Verification | None, History, tuple[Series, ...]]:
-    """Read the history and the chart of each gain, from a verification if that is wanted."""
+def _read(
+    ledger: Ledger, verify: bool, axes: Sequence[str | None] = (), *, is_drawn: bool = False
+) -> tuple[Verification | None, History, tuple[Series, ...]]:
+    """Read the history and the chart of each gain, from a verification if that is wanted.
+
+    Args:
+        ledger: of the cell.
+        verify: check it.
+        axes: whose gains are needed.
+        is_drawn: a gain of any axis is needed.
+    """
     from daq.ledger.ledger import read_history
     from daq.ledger.watch import watch
 
     checked = _verified(ledger) if verify else None
     history = read_history(ledger) if checked is None else checked.history
-    return checked, history, watch(history.entries, history.acknowledgements)
+    all_series = watch(history.entries, history.acknowledgements)
+    if history.may_lack:
+        _require_gains(ledger, checked, all_series, axes, is_drawn=is_drawn)
+    return checked, history, all_series
+
+
+def _require_gains(
+    ledger: Ledger,
+    checked: Verification | None,
+    all_series: tuple[Series, ...],
+    axes: Sequence[str | None],
+    *,
+    is_drawn: bool,
+) -> None:
+    """Refuse to call gains absent that a changed audit log may have; args as of `_read`."""
+    from daq.ledger.ledger import audit_error
+
+    known = {series.axis for series in all_series if series.points}
+    missing = [axis for axis in axes if axis in ledger.cell.axis_names and axis not in known]
+    if missing:
+        found = f"no identified gain of {missing[0]}"
+    elif is_drawn and not known:
+        found = "no identified gain"
+    else:
+        return
+    if checked is not None:
+        raise audit_error(checked.audit, checked.verdict)
+    raise HistoryUnreadable(
+        str(ledger.audit),
+        found=f"{found} that can be read, and changed lines, which may have one",
+        expected="an audit log whose entries were never changed",
+        remedy="see what is wrong with it: drivegain history CELL --verify; no entry was made",
+    )
 
 
 def _verified(ledger: Ledger) -> Verification:

@@ -97,7 +97,6 @@ def write_new_folder(folder: Path) -> Iterator[Path]:
             whole = Path(temporary) / "whole"
             whole.mkdir()
             yield whole
-            whole.chmod(0o755)
             whole.rename(folder)
 
 

@@ -18,6 +18,7 @@ from daq.documents.session_state import GuidedState, Outcome, RecordedRun, Sessi
 from daq.errors import (
     AuditUnusable,
     DaqError,
+    DataError,
     ExitCode,
     HistoryUnreadable,
     OutputFailed,
@@ -85,7 +86,7 @@ def report_failure(context: SessionContext, folder: Path, error: BaseException) 
     notes.
     """
     try:
-        session = next(one for one in sessions.sessions(folder.parent) if one.folder == folder)
+        session = _session_in(folder)
         interrupted = isinstance(error, KeyboardInterrupt)
         outcome = session.state.outcome or (Outcome.INTERRUPTED if interrupted else Outcome.STOPPED)
         code = ExitCode.INTERRUPTED
@@ -105,7 +106,25 @@ def report_failure(context: SessionContext, folder: Path, error: BaseException) 
             context, Conclusion(outcome, int(code), session, remark, next_step), session, problem
         )
     except Exception as second:  # noqa: BLE001 - whatever it is, it must not hide the error that ended the job
-        error.add_note(f"kept: the end of the session may not be recorded: {second}")
+        reason = str(second) or type(second).__name__
+        error.add_note(f"kept: the end of the session may not be recorded: {reason}")
+
+
+def _session_in(folder: Path) -> Session:
+    """Return the session of a folder.
+
+    Raises:
+        DataError: its state cannot be read.
+    """
+    for session in sessions.sessions(folder.parent):
+        if session.folder == folder:
+            return session
+    raise DataError(
+        str(folder),
+        found="no session that can be read",
+        expected="the state of the session that has ended",
+        remedy="restore its folder",
+    )
 
 
 def audit_entry(

@@ -11,6 +11,7 @@ end, or all of it, is missing. docs/decisions/0036 says what this defends agains
 
 from __future__ import annotations
 
+import codecs
 import contextlib
 import errno
 import fcntl
@@ -50,6 +51,12 @@ _BEGINNING = b'{"action":"'  #: Begin of every line: the keys are sorted
 #: Before the digest of a line; in a text of it, the quotation marks would be escaped
 _DIGEST = b',"sha256":"'
 _DIGITS = 64  #: Of a digest, hexadecimal
+CONVERT_BACK = (
+    "keep a copy, convert the file back to UTF-8 without a BOM and with line ends LF "
+    "(`dos2unix FILE`), check it with `drivegain history CELL --verify`, and end what converts it, "
+    "such as an editor, or git (`*.jsonl -text` in .gitattributes)"
+)
+"""What to do about an audit log that another program has converted."""
 
 
 class AuditAction(Enum):
@@ -382,7 +389,7 @@ def _note_head(path: Path, content: bytes, head: str) -> None:
     Raises:
         OSError: the note cannot be written.
     """
-    missing = [one for one in noted_heads(path) if one.encode() not in content]
+    missing = [one for one in noted_heads(path) if not _has_entry(content, one)]
     noted = "".join(f"{one}\n" for one in (*missing, head)).encode()
     descriptor = _open_note(path, os.O_CREAT)
     try:
@@ -391,6 +398,23 @@ def _note_head(path: Path, content: bytes, head: str) -> None:
         _replace_in_place(descriptor, noted)
     finally:
         os.close(descriptor)
+
+
+def _has_entry(content: bytes, digest: str) -> bool:
+    """Whether there is a complete entry of a digest; the beginning of one can have it, too."""
+    mark = _mark_of(digest)
+    for line in _lines_of(content):
+        if mark not in line:
+            continue
+        one, _ = _decode(line)
+        if one is not None and one.sha256 == digest:
+            return True
+    return False
+
+
+def _mark_of(digest: str) -> bytes:
+    """Return the part of a line that has its digest."""
+    return _DIGEST + digest.encode() + b'"'
 
 
 def _replace_in_place(descriptor: int, lines: bytes) -> None:
@@ -447,6 +471,14 @@ def _end_of(content: bytes, path: Path) -> tuple[AuditEntry | None, list[bytes]]
         if one is not None and holds:
             return one, unfinished[::-1]
         if one is not None or not _is_fragment(line):
+            _, conversion = _unconverted(content)
+            if conversion:
+                raise AuditUnusable(
+                    str(path),
+                    found=f"{conversion}, by another program",
+                    expected="an audit log as drivegain writes it",
+                    remedy=f"{CONVERT_BACK}; nothing was written",
+                )
             raise AuditUnusable(
                 str(path),
                 found=f"line {number}, which drivegain did not write",
@@ -457,6 +489,31 @@ def _end_of(content: bytes, path: Path) -> tuple[AuditEntry | None, list[bytes]]
             )
         unfinished.append(line)
     return None, unfinished[::-1]
+
+
+def _unconverted(content: bytes) -> tuple[bytes, str]:
+    """Return an audit log without what another program has converted, and what that was in words;
+    the content as it is, and no words, where it was not converted.
+
+    No entry has a carriage return or a BOM: its text is escaped.
+    """
+    text = content
+    conversions = []
+    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        with contextlib.suppress(UnicodeError):
+            text = content.decode("utf-16").encode()
+            conversions.append("its encoding was converted (UTF-16)")
+    elif content.startswith(codecs.BOM_UTF8):
+        text = content.removeprefix(codecs.BOM_UTF8)
+        conversions.append("its encoding was converted (UTF-8 with a BOM)")
+    line_ends = text.count(b"\n")
+    if line_ends > 0 and text.count(b"\r\n") == line_ends:
+        text = text.replace(b"\r\n", b"\n")
+        conversions.append("its line ends were converted (CRLF)")
+    has_entries = bool(conversions) and any(_decode(line)[1] for line in _lines_of(text))
+    if not has_entries:
+        return content, ""
+    return text, " and ".join(conversions)
 
 
 @contextlib.contextmanager
@@ -554,6 +611,11 @@ class Flaw(Enum):
     MOVED = "moved"
     ADDED = "added"
     CUT_OFF = "cut off"
+    CONVERTED = "converted"  #: The whole file, by another program; its entries are judged without
+    UNFINISHED = "unfinished"  #: The entry was complete when it was noted; its end is lost
+
+
+_LOST = frozenset({Flaw.CUT_OFF, Flaw.UNFINISHED})  #: An entry that was noted is missing
 
 
 @dataclass(frozen=True, slots=True)
@@ -590,7 +652,9 @@ class AuditVerdict:
     entries: tuple[AuditEntry, ...]  #: all of them, in the order of the file
     intact: tuple[AuditEntry, ...]  #: those whose digest is that of their content
     flaws: tuple[AuditFlaw, ...]  #: by their lines; empty for an intact chain
-    torn: tuple[int, ...]  #: lines, from 1, that a killed writer left unfinished; they are no flaw
+    #: Lines, from 1, that a killed writer left unfinished. They are no flaw, but where an entry is
+    #: missing, one of them may be what is left of it.
+    torn: tuple[int, ...]
     open_writes: tuple[OpenWrite, ...]  #: begun and not ended
 
     @property
@@ -599,6 +663,25 @@ class AuditVerdict:
         as far as a chain can show it.
         """
         return not self.flaws
+
+    @property
+    def lacks_noted(self) -> bool:
+        """Whether an entry that was noted elsewhere is missing."""
+        return any(flaw.flaw in _LOST for flaw in self.flaws)
+
+    @property
+    def is_only_converted(self) -> bool:
+        """Whether the entries are what was written, in a file that was converted."""
+        return [flaw.flaw for flaw in self.flaws] == [Flaw.CONVERTED]
+
+    @property
+    def is_torn_end(self) -> bool:
+        """Whether an unfinished line, with a noted entry missing, is all that is wrong: a disk that
+        lost the last bytes leaves that, and so does a person who cuts them off.
+        """
+        kinds = {flaw.flaw for flaw in self.flaws}
+        has_remains = Flaw.UNFINISHED in kinds or bool(self.torn)
+        return bool(kinds) and kinds <= _LOST and has_remains
 
     @property
     def broken(self) -> int | None:
@@ -618,7 +701,8 @@ def judge_chain(
         heads: digests of entries that were noted elsewhere. One that is not in the chain shows that
             its end is missing.
     """
-    chain = _Chain(content)
+    text, conversion = _unconverted(content)
+    chain = _Chain(text)
     for index, (one, holds) in enumerate(chain.decoded):
         if one is None:
             chain.unfinished.append(index)
@@ -626,11 +710,9 @@ def judge_chain(
             chain.take(index, one, holds=holds)
     chain.settle(None)
     entries = tuple(one for one, _ in chain.decoded if one is not None)
-    unknown = sorted(set(heads) - {one.sha256 for one in entries})
-    if unknown:
-        digests = ", ".join(digest[:12] for digest in unknown)
-        says = f"{counted(len(unknown), 'entry')} noted elsewhere and missing here: {digests}"
-        chain.flaws.append(AuditFlaw(len(chain.lines) + 1, Flaw.CUT_OFF, says))
+    chain.find_missing(set(heads) - {one.sha256 for one in entries})
+    if conversion:
+        chain.flaws.append(AuditFlaw(1, Flaw.CONVERTED, conversion))
     flaws = tuple(sorted(chain.flaws, key=lambda flaw: flaw.line))
     return AuditVerdict(
         entries=entries,
@@ -734,6 +816,30 @@ class _Chain:
                 self.number += len(fragments)
                 self.previous = None
         self.unfinished = []
+
+    def find_missing(self, digests: Collection[str]) -> None:
+        """Report entries that were noted elsewhere and are missing, at what is left of them."""
+        missing = []
+        for digest in sorted(digests):
+            place = self._beginning_of(digest)
+            if place is None:
+                missing.append(digest[:12])
+                continue
+            self.torn.remove(place)
+            says = f"the beginning of an entry noted elsewhere ({digest[:12]}), whose end is lost"
+            self._add_flaw(place, Flaw.UNFINISHED, says)
+        if missing:
+            count = counted(len(missing), "entry")
+            says = f"{count} noted elsewhere and missing here: {', '.join(missing)}"
+            self._add_flaw(len(self.lines) + 1, Flaw.CUT_OFF, says)
+
+    def _beginning_of(self, digest: str) -> int | None:
+        """Return the unfinished line that has the digest of its entry; None where there is none."""
+        mark = _mark_of(digest)
+        for place in self.torn:
+            if mark in self.lines[place - 1]:
+                return place
+        return None
 
     def _add_flaw(self, line: int, flaw: Flaw, says: str) -> None:
         self.flaws.append(AuditFlaw(line, flaw, says))

@@ -31,10 +31,10 @@ from daq.errors import (
 )
 from daq.files import fsync_folder
 from daq.ledger.audit import (
+    CONVERT_BACK,
     AuditAction,
     AuditEntry,
     AuditVerdict,
-    Flaw,
     append,
     begun_by,
     entry_after,
@@ -546,11 +546,9 @@ def audit_error(audit: Path, verdict: AuditVerdict) -> DataError:
             remedy="restore it from a backup; if there is none, begin a new log (another name in "
             "`history.audit`)",
         )
-    cut_off = any(flaw.flaw is Flaw.CUT_OFF for flaw in verdict.flaws)
-    if cut_off:
+    note = ""
+    if verdict.lacks_noted:
         note = f" (if the entries that are missing are of another log, remove {head_file(audit)})"
-    else:
-        note = ""
     if len(verdict.flaws) == 1:
         places = "1 place that is"
     else:
@@ -562,9 +560,31 @@ def audit_error(audit: Path, verdict: AuditVerdict) -> DataError:
         f"{audit}, line {first.line}",
         found=f"{places} not what was written{more}\n ",
         expected="entries that were never changed, moved or removed",
-        remedy=f"keep this file as it is, compare it with a backup{note}, ask who can write to it; "
+        remedy=_remedy(verdict, note),
+    )
+
+
+def _remedy(verdict: AuditVerdict, note: str) -> str:
+    """Return what to do about an audit log that is not what was written.
+
+    Args:
+        verdict: on it.
+        note: on the digests that were noted next to it, in brackets.
+    """
+    if verdict.is_only_converted:
+        return f"the entries are what was written: {CONVERT_BACK}"
+    if verdict.is_torn_end:
+        return (
+            "keep a copy, and restore the missing entry, with the `.head`, from a backup"
+            f"{note}; a power failure, a failing disk or an unfinished copy leaves such an end: "
+            "check the disk, and ask who can write to the file where none of them happened; "
+            "without a backup, keep this file and begin another log under a new name "
+            "(`history.audit`)"
+        )
+    return (
+        f"keep this file as it is, compare it with a backup{note}, ask who can write to it; "
         "until that is known trust the controller's file by its backups only, and begin another "
-        "log under a new name (`history.audit`)",
+        "log under a new name (`history.audit`)"
     )
 
 

@@ -429,9 +429,12 @@ def say_verification(found: Verification, console: Console) -> None:
         console.print(printable(f"NOT NOTED: {found.note_obstacle}"))
     if verdict.torn:
         lines = ", ".join(map(str, verdict.torn))
-        console.print(
-            f"Unfinished lines, left by a writer that was killed: {lines}. They are no flaw."
-        )
+        if verdict.lacks_noted:
+            console.print(f"Unfinished lines: {lines}. One may be what is left of a missing entry.")
+        else:
+            console.print(
+                f"Unfinished lines, left by a writer that was killed: {lines}. They are no flaw."
+            )
     for one in verdict.open_writes:
         begun = one.begun
         console.print(

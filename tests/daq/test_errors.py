@@ -132,3 +132,21 @@ def test_folders_that_cannot_be_looked_at_do_not_hide_the_refusal(
     monkeypatch.setattr(Path, "exists", refuse)
     error = OutputFailed.of(tmp_path / "x.csv", closed)
     assert error.found == "permission denied"
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (None, "it was not made"),
+        (b"", "it is empty"),
+        (b"x", "it is as it was"),
+    ],
+)
+def test_an_output_that_failed_is_as_it_was_only_where_there_was_one(
+    tmp_path: Path, content: bytes | None, said: str
+) -> None:
+    path = tmp_path / "calibration.yaml"
+    if content is not None:
+        path.write_bytes(content)
+    error = OutputFailed.of(path, OSError(errno.ENOSPC, "No space left on device"))
+    assert error.remedy.startswith(f"{said}; ")

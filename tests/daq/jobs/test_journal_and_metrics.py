@@ -65,6 +65,29 @@ def test_a_report_that_fails_does_not_hide_the_error_that_ended_the_job(
     assert error.__notes__ == ["kept: the end of the session may not be recorded: no session"]
 
 
+def test_a_report_without_a_readable_session_says_what_is_missing(tmp_path: Path) -> None:
+    error = DriveFault(3, "fault")
+    context = cast("SessionContext", None)  # the report fails before it is used
+    folder = tmp_path / "session"
+    report_failure(context, folder, error)
+    (note,) = error.__notes__
+    assert note.startswith("kept: the end of the session may not be recorded: ")
+    assert f"{folder}: found no session that can be read" in note
+
+
+def test_a_report_that_fails_without_words_names_the_kind_of_its_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def out_of_memory(*_: object) -> NoReturn:
+        raise MemoryError
+
+    monkeypatch.setattr("daq.jobs.session.sessions", out_of_memory)
+    error = DriveFault(3, "fault")
+    context = cast("SessionContext", None)  # the report fails before it is used
+    report_failure(context, tmp_path, error)
+    assert error.__notes__ == ["kept: the end of the session may not be recorded: MemoryError"]
+
+
 def test_a_person_reads_words_and_no_control_characters() -> None:
     line = said(Form.TEXT, text="one\n\x1b[31mtwo", share=0.25)
     assert line.count("\n") == 1

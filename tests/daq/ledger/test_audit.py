@@ -311,6 +311,53 @@ def test_what_killed_writers_leave_stays_and_is_reported(
             assert not with_changed.holds
 
 
+@pytest.mark.parametrize(
+    ("cut_bytes", "flaw", "torn"),
+    [
+        pytest.param(30, (6, Flaw.UNFINISHED), (), id="its digest is left"),
+        pytest.param(250, (9, Flaw.CUT_OFF), (6,), id="its digest is lost"),
+    ],
+)
+def test_a_noted_entry_that_was_torn_stays_missing_after_later_entries(
+    tmp_path: Path, cut_bytes: int, flaw: tuple[int, Flaw], torn: tuple[int, ...]
+) -> None:
+    path = tmp_path / "a"
+    lost = _filled(path)[-1]
+    content = path.read_bytes()
+    path.write_bytes(content[:-cut_bytes])
+    first_heads = audit.noted_heads(path)
+    first = verify(path, heads=first_heads)
+    assert len(first.flaws) == 1
+    assert lost.sha256[:12] in first.flaws[0].says
+    assert first.torn == torn
+    assert first.is_torn_end
+    _append(path, AuditAction.APPLIED, "x", {})
+    later_heads = audit.noted_heads(path)
+    assert lost.sha256 in later_heads
+    later = verify(path, heads=later_heads)
+    assert _flaws(later) == [flaw]
+    assert lost.sha256[:12] in later.flaws[0].says
+    assert later.torn == torn
+    _append(path, AuditAction.APPLIED, "x", {})
+    assert lost.sha256 in audit.noted_heads(path)
+
+
+def test_an_unfinished_line_whose_entry_was_never_noted_is_no_flaw(tmp_path: Path) -> None:
+    path = tmp_path / "a"
+    _filled(path, 2)
+    note = audit.head_file(path)
+    noted = note.read_bytes()
+    _filled(path, 1)
+    content = path.read_bytes()
+    path.write_bytes(content[:-30])  # killed while it appended
+    note.write_bytes(noted)
+    for _ in range(2):
+        verdict = verify(path, heads=audit.noted_heads(path))
+        assert verdict.holds
+        assert verdict.torn == (3,)
+        _append(path, AuditAction.APPLIED, "x", {})
+
+
 def test_zeros_after_a_power_cut_are_an_unfinished_line(tmp_path: Path) -> None:
     path = tmp_path / "a"
     _filled(path, 2)

@@ -737,6 +737,87 @@ def test_a_broken_audit_is_reported_by_its_first_line(
     assert document["audit"]["broken_line"] == 3
 
 
+def _to_crlf(content: bytes) -> bytes:
+    return content.replace(b"\n", b"\r\n")
+
+
+def _to_utf_16(content: bytes) -> bytes:
+    return content.decode().encode("utf-16")
+
+
+def _indented(content: bytes) -> bytes:
+    entries = [json.loads(line) for line in content.splitlines()]
+    return "\n".join(json.dumps(entry, indent=2) for entry in entries).encode()
+
+
+def _entered_by_hand(cell_file: Path) -> Path:
+    """A calibration that the history has."""
+    file = cell_file.parent / "calibration.yaml"
+    save_calibration(calibration_of(0), file)
+    assert _history(cell_file, "--add", file) == 0
+    return file
+
+
+@pytest.mark.parametrize(
+    ("convert", "said"),
+    [
+        pytest.param(_to_crlf, "its line ends were converted (CRLF)", id="CRLF"),
+        pytest.param(_to_utf_16, "its encoding was converted (UTF-16)", id="UTF-16"),
+    ],
+)
+def test_verify_of_a_converted_log_is_one_finding_and_nothing_is_entered(
+    cell_file: Path,
+    convert: Callable[[bytes], bytes],
+    said: str,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    _entered_by_hand(cell_file)
+    path = _place(cell_file).audit
+    written = path.read_bytes()
+    path.write_bytes(convert(written))
+    capsys.readouterr()
+    reported = _verified(cell_file, capsys)
+    assert "1 place that is not what was written" in reported
+    assert said in reported
+    assert "dos2unix" in reported
+    assert "who can write to it" not in reported
+    other = cell_file.parent / "other.yaml"
+    save_calibration(calibration_of(1), other)
+    for arguments in (("--acknowledge", "J4", "--why", "new motor"), ("--add", other)):
+        assert _history(cell_file, *arguments) == 3
+        refused = _one_spaced(capsys.readouterr().err)
+        assert said in refused
+        assert "nothing was written" in refused
+    assert path.read_bytes() == convert(written)
+    path.write_bytes(written)
+    assert _history(cell_file, "--verify") == 0
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("--acknowledge", "J4", "--why", "new motor"),
+        ("--axis", "J4"),
+        ("--axis", "J4", "--json"),
+        ("--plot", "gains.png"),
+    ],
+)
+def test_gains_that_cannot_be_read_in_a_changed_log_are_not_called_absent(
+    cell_file: Path, arguments: tuple[str, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    _entered_by_hand(cell_file)
+    path = _place(cell_file).audit
+    changed = _indented(path.read_bytes())
+    path.write_bytes(changed)
+    capsys.readouterr()
+    assert _history(cell_file, *arguments) == 4
+    refused = _one_spaced(capsys.readouterr().err)
+    assert "changed lines, which may have one" in refused
+    assert "drivegain history CELL --verify" in refused
+    assert "--add" not in refused
+    assert path.read_bytes() == changed
+
+
 def test_an_audit_whose_end_was_cut_off_is_noticed(
     cell_file: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

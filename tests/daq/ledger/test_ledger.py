@@ -529,6 +529,31 @@ def test_a_damaged_log_is_reported_by_each_command_that_reads_or_adds_to_it(
         assert MAY_LACK in caplog.text
 
 
+@pytest.mark.parametrize("cut_bytes", [20, 300])
+def test_verify_of_a_torn_noted_entry_names_it_before_and_after_the_next_entry(
+    cell_file: Path, cut_bytes: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    calibration = calibration_for(cell_file)
+    assert run_verb("history", cell_file, "--add", calibration) == ExitCode.OK
+    path = ledger_of(cell_file).audit
+    lost = read(path)[-1].sha256
+    content = path.read_bytes()
+    path.write_bytes(content[:-cut_bytes])
+    for factor in (1.01, 1.02):
+        capsys.readouterr()
+        assert run_verb("history", cell_file, "--verify") == ExitCode.DATA_UNFIT
+        captured = capsys.readouterr()
+        printed = " ".join(captured.out.split())
+        error_output = " ".join(captured.err.split())
+        assert "chain BROKEN" in printed
+        assert "They are no flaw" not in printed
+        assert lost[:12] in error_output
+        assert "a power failure" in error_output
+        assert "trust the controller's file" not in error_output
+        later = calibration_for(cell_file, factor)
+        assert run_verb("history", cell_file, "--add", later) == ExitCode.OK
+
+
 def test_a_log_without_its_note_is_said_to_be_one(
     cell_file: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
