@@ -75,6 +75,17 @@ def _subject_as_before(found: re.Match[str], facts: Facts) -> bool:
     return facts.is_as_before(path)
 
 
+def _subject_missing(found: re.Match[str], facts: Facts) -> bool:
+    """Hold where there is neither a file nor a folder of that name."""
+    subject = Path(found["subject"])
+    return not any(path.is_relative_to(subject) for path in facts.after)
+
+
+def _subject_empty(found: re.Match[str], facts: Facts) -> bool:
+    """Hold where there is a file without content."""
+    return facts.after.get(Path(found["subject"])) == b""
+
+
 def _written_with_backup(found: re.Match[str], facts: Facts) -> bool:
     backup = facts.controller.parent / found["backup"]
     return (
@@ -126,6 +137,10 @@ def _is_any(_: re.Match[str], __: Facts) -> bool:
 RULES = (
     Rule(r"error: (?P<subject>\S+) found: [^;]*? do: it is as it was", _subject_as_before),
     Rule(r"(?P<subject>/\S+): found [^;]*; expected [^;]*; it is as it was", _subject_not_begun),
+    Rule(r"error: (?P<subject>\S+) found: [^;]*? do: it was not made", _subject_missing),
+    Rule(r"(?P<subject>/\S+): found [^;]*; expected [^;]*; it was not made", _subject_missing),
+    Rule(r"error: (?P<subject>\S+) found: [^;]*? do: it is empty", _subject_empty),
+    Rule(r"(?P<subject>/\S+): found [^;]*; expected [^;]*; it is empty", _subject_empty),
     Rule(r"nothing was written to the controller", _is_old),
     Rule(r"nothing was written to the drives", _is_old),
     Rule(r"nothing was (written|changed|restored)", _is_old),
@@ -176,7 +191,7 @@ RULES = (
     Rule(r"`drivegain rollback \S+` undoes it", _is_any),
 )
 CLAIMS = re.compile(
-    r"\b(written|unchanged|as it was|as before|restored|rolled "
+    r"\b(written|unchanged|as it was|not made|is empty|as before|restored|rolled "
     r"back|kept|complete|completely|lacks|does not have|not "
     r"known|was changed|undone|lost|saved|replaced|enters?|entered|removed?|noted)\b",
     re.IGNORECASE,

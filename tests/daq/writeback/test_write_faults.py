@@ -319,6 +319,20 @@ def test_a_file_in_a_folder_that_was_not_made_is_as_it_was() -> None:
     assert false_sentences(said, replace(facts, not_made=frozenset((folder,)))) == ()
 
 
+def test_a_file_that_is_said_not_to_be_made_or_to_be_empty_is_so() -> None:
+    missing = "error: /cell/a.jsonl found: no space expected: room do: it was not made; free space"
+    empty = "error: /cell/a.jsonl found: no space expected: room do: it is empty; free space"
+    audit = Path("/cell/a.jsonl")
+    facts = Facts(Content.OLD, Path("/cell/gains.yaml"), {}, {}, (), False)
+    emptied = replace(facts, after={audit: b""})
+    written = replace(facts, after={audit: b"line"})
+    assert false_sentences(missing, facts) == ()
+    assert false_sentences(missing, emptied)
+    assert false_sentences(empty, emptied) == ()
+    assert false_sentences(empty, facts)
+    assert false_sentences(empty, written)
+
+
 def test_a_note_that_is_said_to_be_lacking_was_not_made() -> None:
     note = Path("/cell/a.jsonl.head")
     said = (
