@@ -6,6 +6,7 @@ No pyplot, which keeps figures in a global list.
 from __future__ import annotations
 
 import io
+import logging
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -30,6 +31,10 @@ QUANTITY = {"Nm": "torque", "N": "force"}
 DPI = 130
 _PANEL_IN = (5.6, 2.0)
 _TITLE_AND_LEGEND_IN = 1.1
+
+# Without a home folder that can be written, it takes a temporary one, and says so in two lines that
+# nobody needs to act on.
+logging.getLogger("matplotlib").setLevel(logging.ERROR)
 
 
 def panels(count: int, columns: int, title: str) -> tuple[Figure, list[Axes]]:
