@@ -21,6 +21,7 @@ from daq.jobs.context import (
     Tools,
     before_motion,
     nearest_folder,
+    require_replaceable,
     sessions_that_count,
 )
 from daq.jobs.gain_target import target_of
@@ -143,6 +144,7 @@ def _resumed_or_new(context: SessionContext) -> Session:
         _say_why_new(context, found, now)
         session = sessions.begin(folder, session_basis(context.cell), now, GuidedState)
         context.journal.say(Level.NOTICE, "session begun", folder=str(session.folder))
+        _warn_of_unwritable(context)
         return session
     attempt = session.state.attempt + 1
     blocks = [run.name for run in session.state.runs]
@@ -150,6 +152,17 @@ def _resumed_or_new(context: SessionContext) -> Session:
         Level.NOTICE, "session taken up", attempt=attempt, recorded=", ".join(blocks) or "nothing"
     )
     return sessions.resume(session, now)
+
+
+def _warn_of_unwritable(context: SessionContext) -> None:
+    """Say before anything moves that this user cannot write the gains: another one may apply them
+    after the session.
+    """
+    try:
+        require_replaceable(context)
+    except DaqError as error:
+        text = f"{error.subject}: {error.found}"
+        context.journal.say(Level.WARNING, "this user cannot write the gains", text=text)
 
 
 def _say_why_new(context: SessionContext, found: tuple[Session, ...], now: datetime) -> None:
@@ -247,7 +260,8 @@ def _ready_text(context: SessionContext) -> str:
     there = nearest_folder(context.settings.folder)
     tools = replace(context.tools, free=lambda _: context.tools.free(there))
     quiet = replace(context.journal, stream=StringIO())
-    before_motion(replace(context, tools=tools, journal=quiet), take_over=False)
+    checked = replace(context, tools=tools, journal=quiet, must_write=True)
+    before_motion(checked, take_over=False)
     return (
         "free space, files that can be written, history readable, robot released, drives as "
         "declared and without power"

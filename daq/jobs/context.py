@@ -346,7 +346,9 @@ class SessionContext:
     journal: Journal  #: log of the session, labelled with session and stage
     began_s: float = 0.0  #: start on the monotonic clock [s]
     block_signals: SignalBlocker = nullcontext  #: keeps signals away while the axes are stopped
-    writes: bool = True  #: whether the gains may be written; a job may only propose them
+    #: Whether nobody but this session can write the gains. A job may only propose them, and after
+    #: a guided session another person may apply them.
+    must_write: bool = False
 
     @property
     def who(self) -> str:
@@ -502,7 +504,7 @@ def nearest_folder(folder: Path) -> Path:
 
 def require_writable(context: SessionContext) -> None:
     """Check that the session can write what it will write after the recordings:
-    its folder, the audit log, and the controller's file if it may write the gains.
+    its folder, the audit log, and the controller's file if nobody else writes the gains.
 
     What it makes to try that is removed again.
 
@@ -515,10 +517,21 @@ def require_writable(context: SessionContext) -> None:
     audit = context.target.history.audit
     with _tried(audit, "an audit log that this user may write"):
         try_append(audit)
+    if context.must_write:
+        require_replaceable(context)
+
+
+def require_replaceable(context: SessionContext) -> None:
+    """Check that this user can replace the controller's file; gains in drives have none.
+
+    Raises:
+        OutputFailed, ControllerUnfit: the file cannot be replaced; nothing has moved.
+    """
     file = context.target.file
-    if file is not None and context.writes:
-        with _tried(file, "a controller's file that this session can replace"):
-            try_writing(file, context.tools.now())
+    if file is None:
+        return
+    with _tried(file, "a controller's file that this session can replace"):
+        try_writing(file, context.tools.now())
 
 
 @contextmanager

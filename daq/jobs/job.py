@@ -171,7 +171,7 @@ def _context(
         tools,
         journal,
         began_s=tools.monotonic_s(),
-        writes=policy.writes,
+        must_write=policy.writes,
     )
 
 

@@ -173,6 +173,8 @@ SENTENCES = {
     "recorded again.",
     "set aside": "The earlier recording is now {log}.",
     "warning of the recorder": "! {text}",
+    "this user cannot write the gains": "! This user cannot write the gains: {text}. The session "
+    "ends with its certificate, and someone who may write can apply the calibration.",
     "weighed": "By the moves, {added_kg:.2g} kg more than without load.",
     "mistake in a block": "\n! {text}",
     "kept as it is": "{block} is used as it is.",

@@ -1513,6 +1513,21 @@ def test_input_that_ends_ends_the_session_where_it_is(
     assert run_session(rig).outcome is Outcome.APPLIED
 
 
+def test_a_controllers_file_that_this_user_cannot_replace_is_said_before_anything_moves(
+    tmp_path: Path, made_session: MadeSession, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another user may apply the calibration: the session goes on."""
+    folder = tmp_path / "cell"
+    rig = made_session_rig(folder, made_session)
+    (rig.controller.parent / f".{rig.controller.name}.lock").mkdir()
+    operator = person(rig, monkeypatch, "")
+    with pytest.raises(JobHeld, match="the input has ended"):
+        run_session(rig, operator)
+    said = rig.said.getvalue()
+    assert said.count("this user cannot write the gains") == 1
+    assert rig.session.state.runs == ()
+
+
 def test_each_block_asks_before_power_comes_on(
     tmp_path: Path, made_session: MadeSession, monkeypatch: pytest.MonkeyPatch
 ) -> None:
