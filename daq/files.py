@@ -92,7 +92,7 @@ def try_replacing(path: Path, *, like: Path | None = None) -> None:
             _copy_rights(descriptor, model)
     finally:
         os.close(descriptor)
-        temporary.unlink()
+        temporary.unlink(missing_ok=True)
 
 
 def require_takes_files(folder: Path) -> None:

@@ -426,7 +426,7 @@ def _advice_for_evidence(error: Exception, verb: str) -> tuple[str, str] | None:
 
 def _advice_for_fault(error: driver.DriveFault, verb: str) -> tuple[str, str] | None:
     """Return expected and remedy of a fault that has no code of an EMCY; None for one with it."""
-    # An error without its fields is one of a library that was made by hand.
+    # Errors that were made without their constructor lack these fields.
     code = getattr(error, "emcy_code", None)
     statusword = getattr(error, "statusword", None)
     remedy = getattr(error, "remedy", "")

@@ -272,7 +272,7 @@ def _require_gains(
         raise audit_error(checked.audit, checked.verdict)
     raise HistoryUnreadable(
         str(ledger.audit),
-        found=f"{found} that can be read, and changed lines, which may have one",
+        found=f"{found} that can be read; changed lines may have one",
         expected="an audit log whose entries were never changed",
         remedy="see what is wrong with it: drivegain history CELL --verify; no entry was made",
     )

@@ -20,7 +20,7 @@ from daq.jobs.context import (
     SessionContext,
     Tools,
     before_motion,
-    nearest_folder,
+    nearest_existing_folder,
     require_replaceable,
     sessions_that_count,
 )
@@ -257,7 +257,7 @@ def _payload_text(cell: Cell, name: str | None) -> str:
 
 
 def _ready_text(context: SessionContext) -> str:
-    there = nearest_folder(context.settings.folder)
+    there = nearest_existing_folder(context.settings.folder)
     tools = replace(context.tools, free=lambda _: context.tools.free(there))
     quiet = replace(context.journal, stream=StringIO())
     checked = replace(context, tools=tools, journal=quiet, must_write=True)

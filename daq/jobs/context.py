@@ -18,11 +18,8 @@ from daq.config.recalibration import PlannedRun, Recalibration
 from daq.errors import (
     ConfigurationInconsistent,
     DiskSpaceShort,
-    FileImmutable,
     JobHeld,
     OutputFailed,
-    OwnerNotKept,
-    reason_of,
     writing,
 )
 from daq.files import require_takes_files
@@ -496,7 +493,7 @@ def _require_own_history(context: SessionContext) -> None:
         context.journal.say(Level.WARNING, "the cell may have been renamed", text=text)
 
 
-def nearest_folder(folder: Path) -> Path:
+def nearest_existing_folder(folder: Path) -> Path:
     """Return a folder, or the nearest one above it that is there."""
     folders = (folder, *folder.parents)
     return next(path for path in folders if path.is_dir())
@@ -512,10 +509,10 @@ def require_writable(context: SessionContext) -> None:
         OutputFailed, AuditUnusable, ControllerUnfit: it cannot; nothing has moved.
     """
     folder = context.settings.folder
-    with _tried(folder, "a folder for sessions that this user may write"):
-        require_takes_files(nearest_folder(folder))
+    with _reporting_refusals(folder, "a folder for sessions that this user may write"):
+        require_takes_files(nearest_existing_folder(folder))
     audit = context.target.history.audit
-    with _tried(audit, "an audit log that this user may write"):
+    with _reporting_refusals(audit, "an audit log that this user may write"):
         try_append(audit)
     if context.must_write:
         require_replaceable(context)
@@ -530,12 +527,12 @@ def require_replaceable(context: SessionContext) -> None:
     file = context.target.file
     if file is None:
         return
-    with _tried(file, "a controller's file that this session can replace"):
+    with _reporting_refusals(file, "a controller's file that this session can replace"):
         try_writing(file, context.tools.now())
 
 
 @contextmanager
-def _tried(place: Path, expected: str) -> Iterator[None]:
+def _reporting_refusals(place: Path, expected: str) -> Iterator[None]:
     """Report a refusal of the file system in the block, before anything moves.
 
     Raises:
@@ -544,27 +541,19 @@ def _tried(place: Path, expected: str) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        if isinstance(error, OwnerNotKept | FileImmutable):
-            refused = OutputFailed.of(place, error)
-            raise OutputFailed(
-                refused.subject,
-                found=refused.found,
-                expected=refused.expected,
-                remedy=f"nothing has moved; {refused.remedy}",
-            ) from error
         missing = OutputFailed.of_missing_folder(place, error)
         if missing is not None:
             raise missing from error
-        found = reason_of(error)
-        refused_name = error.filename
-        if refused_name is not None and str(refused_name) != str(place):
-            found = f"{refused_name}: {found}"
+        refused = OutputFailed.of(place, error)
+        found = refused.found
+        failing_path = error.filename
+        if failing_path is not None and str(failing_path) != str(place):
+            found = f"{failing_path}: {found}"
         raise OutputFailed(
-            str(place),
+            refused.subject,
             found=found,
             expected=expected,
-            remedy="nothing has moved; give this user the right to make files there, or mount it "
-            "so that it can be written, then repeat the command",
+            remedy=f"nothing has moved; {refused.remedy}",
         ) from error
 
 
@@ -596,7 +585,7 @@ def before_motion(context: SessionContext, *, take_over: bool = True) -> None:
         )
     # What is wrong with it is better known now than after the recordings.
     require_writable(context)
-    # The gains are compared with it.
+    # The new gains are compared with the history.
     _require_own_history(context)
     release_check(context.cell, tools.now, tools.run)()
     context.journal.say(Level.INFO, "the interlock lets the robot move", free_mb=round(free_mb))

@@ -22,7 +22,7 @@ from daq.jobs.context import (
     SessionContext,
     Tools,
     before_motion,
-    nearest_folder,
+    nearest_existing_folder,
     require_writable,
     section_of,
     sessions_that_count,
@@ -113,7 +113,9 @@ def preview(
     who: str,
     lock_folder: Path | None = None,
 ) -> Preview:
-    """Make all checks of a job before its first motion, and list its steps; nothing is written.
+    """Make all checks of a job before its first motion, and list its steps.
+
+    What it makes to try whether files can be written is removed again.
 
     Raises:
         the errors of `recalibrate` up to the first motion.
@@ -133,7 +135,7 @@ def preview(
             made = tuple(run.name for run in verified_runs(session).state.runs)
         left = [run for run in section.runs if run.name not in made]
         if left:
-            folder = nearest_folder(section.folder)
+            folder = nearest_existing_folder(section.folder)
             there = replace(tools, free=lambda _: tools.free(folder))
             before_motion(replace(context, tools=there), take_over=False)
         else:

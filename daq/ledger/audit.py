@@ -471,7 +471,7 @@ def _end_of(content: bytes, path: Path) -> tuple[AuditEntry | None, list[bytes]]
         if one is not None and holds:
             return one, unfinished[::-1]
         if one is not None or not _is_fragment(line):
-            _, conversion = _unconverted(content)
+            _, conversion = _undo_conversion(content)
             if conversion:
                 raise AuditUnusable(
                     str(path),
@@ -491,7 +491,7 @@ def _end_of(content: bytes, path: Path) -> tuple[AuditEntry | None, list[bytes]]
     return None, unfinished[::-1]
 
 
-def _unconverted(content: bytes) -> tuple[bytes, str]:
+def _undo_conversion(content: bytes) -> tuple[bytes, str]:
     """Return an audit log without what another program has converted, and what that was in words;
     the content as it is, and no words, where it was not converted.
 
@@ -611,11 +611,11 @@ class Flaw(Enum):
     MOVED = "moved"
     ADDED = "added"
     CUT_OFF = "cut off"
-    CONVERTED = "converted"  #: The whole file, by another program; its entries are judged without
+    CONVERTED = "converted"  #: The whole file, by another program; entries are judged as before it
     UNFINISHED = "unfinished"  #: The entry was complete when it was noted; its end is lost
 
 
-_LOST = frozenset({Flaw.CUT_OFF, Flaw.UNFINISHED})  #: An entry that was noted is missing
+_MISSING_ENTRY = frozenset({Flaw.CUT_OFF, Flaw.UNFINISHED})  #: An entry that was noted is missing
 
 
 @dataclass(frozen=True, slots=True)
@@ -667,7 +667,7 @@ class AuditVerdict:
     @property
     def lacks_noted(self) -> bool:
         """Whether an entry that was noted elsewhere is missing."""
-        return any(flaw.flaw in _LOST for flaw in self.flaws)
+        return any(flaw.flaw in _MISSING_ENTRY for flaw in self.flaws)
 
     @property
     def is_only_converted(self) -> bool:
@@ -676,12 +676,18 @@ class AuditVerdict:
 
     @property
     def is_torn_end(self) -> bool:
-        """Whether an unfinished line, with a noted entry missing, is all that is wrong: a disk that
-        lost the last bytes leaves that, and so does a person who cuts them off.
+        """Whether unfinished lines and a noted entry that is missing are all that is wrong: a disk
+        that lost the last bytes leaves that, and so does a person who cuts them off.
         """
         kinds = {flaw.flaw for flaw in self.flaws}
-        has_remains = Flaw.UNFINISHED in kinds or bool(self.torn)
-        return bool(kinds) and kinds <= _LOST and has_remains
+        has_remains = Flaw.UNFINISHED in kinds or self.may_be_torn
+        return bool(kinds) and kinds <= _MISSING_ENTRY and has_remains
+
+    @property
+    def may_be_torn(self) -> bool:
+        """Whether an unfinished line may be what is left of a noted entry that is missing."""
+        is_cut_off = any(flaw.flaw is Flaw.CUT_OFF for flaw in self.flaws)
+        return is_cut_off and bool(self.torn)
 
     @property
     def broken(self) -> int | None:
@@ -701,7 +707,7 @@ def judge_chain(
         heads: digests of entries that were noted elsewhere. One that is not in the chain shows that
             its end is missing.
     """
-    text, conversion = _unconverted(content)
+    text, conversion = _undo_conversion(content)
     chain = _Chain(text)
     for index, (one, holds) in enumerate(chain.decoded):
         if one is None:

@@ -575,11 +575,10 @@ def _remedy(verdict: AuditVerdict, note: str) -> str:
         return f"the entries are what was written: {CONVERT_BACK}"
     if verdict.is_torn_end:
         return (
-            "keep a copy, and restore the missing entry, with the `.head`, from a backup"
-            f"{note}; a power failure, a failing disk or an unfinished copy leaves such an end: "
-            "check the disk, and ask who can write to the file where none of them happened; "
-            "without a backup, keep this file and begin another log under a new name "
-            "(`history.audit`)"
+            "keep a copy; restore the log and its `.head` from a backup, or without one begin "
+            "another log under a new name (`history.audit`). A power failure, a failing disk or an "
+            "unfinished copy leaves such an end: check the disk. If none of them happened, ask who "
+            f"can write to the file{note}"
         )
     return (
         f"keep this file as it is, compare it with a backup{note}, ask who can write to it; "

@@ -231,7 +231,8 @@ def _refuse_other_kind(path: Path, source: Path, head: bytes) -> None:
             expected=expected,
             remedy="check --data and the file name in the import description",
         ) from error
-    if any(magic.startswith(head) for magic in (MAGIC, SQLITE_MAGIC, ROS_1_MAGIC)):
+    magics = (MAGIC, SQLITE_MAGIC, ROS_1_MAGIC)
+    if head and any(magic.startswith(head) for magic in magics):
         size = counted(len(head), "byte")
         raise LogTruncated(
             str(path),

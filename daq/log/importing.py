@@ -692,8 +692,8 @@ def _check_columns(wanted: ImportDescription, description: Path, data: Path) -> 
             is_called_csv = Path(file).suffix.lower() == ".csv"
             if not is_called_csv and reader_of(data / file) is read_csv:
                 remedy += (
-                    f"; if {file} is to be a bag, whose joints are in both: its content is no bag, "
-                    "and it is read as a CSV file"
+                    f"; {file} is read as a CSV file, because its content is no bag: if it should "
+                    "be one, copy it again"
                 )
             raise ConfigurationInconsistent(
                 f"{description}: {key}",

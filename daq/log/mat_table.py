@@ -181,6 +181,7 @@ def _content(path: Path) -> memoryview:
         remedy = "in MATLAB: save('run.mat', 'q', 'i', 't', '-v7') with the names of your variables"
     else:
         found, remedy = kind_of_content(content[:_SHOWN_BYTES])
+        remedy += "; of MATLAB or Octave, save the variables with -v7"
     raise TableUnfit(
         str(path),
         found=found,

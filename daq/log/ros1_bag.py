@@ -24,6 +24,7 @@ from daq.log.mcap_bag import BagMessage, Topic
 from daq.log.message import JOINTS_SCHEMA
 
 ROS_1_MAGIC = b"#ROSBAG V"
+ROS_1_VERSION = b"#ROSBAG V2.0"  #: First line of a bag that is read
 _DAMAGE = (
     AssertionError,
     AttributeError,
@@ -103,7 +104,8 @@ class Ros1Bag:
         """
         with open_regular(self._source) as stream:
             size = os.fstat(stream.fileno()).st_size
-            stream.readline()
+            if stream.readline().strip() != ROS_1_VERSION:
+                return  # the library names its version
             fields = header.read(stream)
             index_at = fields.get_uint64("index_pos")
             if index_at == 0:

@@ -429,7 +429,7 @@ def say_verification(found: Verification, console: Console) -> None:
         console.print(printable(f"NOT NOTED: {found.note_obstacle}"))
     if verdict.torn:
         lines = ", ".join(map(str, verdict.torn))
-        if verdict.lacks_noted:
+        if verdict.may_be_torn:
             console.print(f"Unfinished lines: {lines}. One may be what is left of a missing entry.")
         else:
             console.print(

@@ -154,7 +154,9 @@ def _lock_of(target: Path) -> Path:
 def try_writing(file: Path, now: datetime) -> None:
     """Try whether a write of a controller's file could make its files: lock, backup, new content.
 
-    Each of them is made empty and removed again; the controller's file is only read.
+    Each of them is made empty and removed again; the controller's file is only read. Nothing is
+    tried while another process writes it: then there is room for them, and an unfinished copy would
+    be removed by that process.
 
     Args:
         file: as it was declared.
@@ -167,12 +169,11 @@ def try_writing(file: Path, now: datetime) -> None:
     require_existing(file)
     target = resolve_links(file)
     content = read_controller_file(target)
-    # Another writer has the lock: it is there, and free again in a moment.
-    with contextlib.suppress(BlockingIOError), hold_lock(_lock_of(target)):
-        pass
     # The digest of the new content is not known yet; a name has the same length with any.
-    try_replacing(_new_backup(target, content, content, now), like=target)
-    try_replacing(target)
+    backup = _new_backup(target, content, content, now)
+    with contextlib.suppress(BlockingIOError), hold_lock(_lock_of(target)):
+        try_replacing(backup, like=target)
+        try_replacing(target)
 
 
 def _remove_unfinished(target: Path) -> None:

@@ -7,7 +7,8 @@ region that the fit had not seen, such a fit was off by 18 % of the torque, the 
 by 5 %. Likewise, friction that depends on the position can be negative where no run has been.
 
 So the declared dry and viscous friction is judged together with all effects of the speed and of the
-position on its axis, one's own as well. With c their coefficients and φ(v, q) their columns, it is
+position on its axis, including a user's own. With c their coefficients and φ(v, q) their columns,
+it is
 
     f(v, q) = fs + fv |v| + sign(v) Σ c φ(v, q) ≥ 0,
 
@@ -29,25 +30,42 @@ import numpy as np
 from ident.arrays import FloatArray, IntArray
 from ident.discovery.evidence import Evidence
 from ident.discovery.gates import SIGMAS, own_unknowns
-from ident.effects.effect import Effect, GearSide, PlacedEffect, Property, columns_at
+from ident.effects.effect import (
+    Effect,
+    GearSide,
+    PlacedEffect,
+    Property,
+    columns_at,
+    is_shipped,
+)
 from ident.effects.signals import Abscissa, Signals
+from ident.errors import EffectRefused
 from ident.model.bodies import LOADED
 
 #: Speeds at which friction is judged, as shares of the largest; the first is the limit at rest
 SPEEDS = np.concatenate(([1e-6], np.geomspace(1e-3, 1.0, 25)))
 #: Positions at which friction that depends on the position is judged: over one turn, 7.7° apart
 POSITIONS = 48
-FRICTION = frozenset({Property.ODD_IN_VELOCITY, Property.EVEN_IN_VELOCITY})
-"""Properties of friction; an even one is more friction in one direction than in the other."""
 
 
 def is_friction_of_motion(effect: Effect) -> bool:
-    """Whether an effect is friction of a driven joint by its speed and position alone."""
+    """Whether an effect is friction of a driven joint by its speed and position alone.
+
+    What is even in the velocity and depends on the position is a spring, which may push.
+    """
+    match effect.declares:
+        case Property.ODD_IN_VELOCITY:
+            abscissas = {Abscissa.VELOCITY, Abscissa.POSITION}
+        case Property.EVEN_IN_VELOCITY:
+            abscissas = {Abscissa.VELOCITY}
+        case _:
+            return False
     return (
-        effect.declares in FRICTION
-        and effect.abscissa in {Abscissa.VELOCITY, Abscissa.POSITION}
+        effect.abscissa in abscissas
         and effect.side is GearSide.JOINT
         and effect.with_motor
+        and not effect.needs_inertia
+        and not effect.axis_setting
     )
 
 
@@ -61,7 +79,11 @@ def describe_driving_friction(evidence: Evidence, axis: int) -> str:
     effects = _judged_effects(evidence, axis)
     if not effects:
         return ""
-    is_of_position = any(placed.effect.abscissa is Abscissa.POSITION for placed in effects)
+    # An effect of one's own may depend on the position besides the speed that it names.
+    is_of_position = any(
+        placed.effect.abscissa is Abscissa.POSITION or not is_shipped(placed.effect)
+        for placed in effects
+    )
     positions_rad = np.zeros(1)
     if is_of_position:
         positions_rad = _positions(evidence, axis)
@@ -191,8 +213,8 @@ def _motion(axes: int, velocity: FloatArray, position_rad: FloatArray) -> Signal
         velocity: of each sample [rad/s; m/s of a prismatic joint], shape (k,).
         position_rad: of each sample, shape (k,).
     """
-    of_joints = (axes, 1)
-    positions_rad = np.tile(position_rad, of_joints)
+    once_a_joint = (axes, 1)
+    positions_rad = np.tile(position_rad, once_a_joint)
     nothing = np.zeros(positions_rad.shape)
     samples = np.arange(len(velocity), dtype=np.float64)
     return Signals(
@@ -200,7 +222,7 @@ def _motion(axes: int, velocity: FloatArray, position_rad: FloatArray) -> Signal
         time_s=samples,
         session_s=samples,
         position_rad=positions_rad,
-        velocity_rad_s=np.tile(velocity, of_joints),
+        velocity_rad_s=np.tile(velocity, once_a_joint),
         acceleration_rad_s2=nothing,
         motor_position_rad=positions_rad,
         inertia_kg_m2=np.empty((axes, axes, 0)),
@@ -209,6 +231,26 @@ def _motion(axes: int, velocity: FloatArray, position_rad: FloatArray) -> Signal
         motor_torque_nm=nothing,
         current_a=nothing,
     )
+
+
+def _columns_of(
+    placed: PlacedEffect, axes: int, velocity: FloatArray, position_rad: FloatArray
+) -> FloatArray | None:
+    """Columns of an effect at velocities and positions, shape (p, k).
+
+    None where they are no function of these: an effect of one's own needs the load, or what came
+    before a sample.
+    """
+    onward = _motion(axes, velocity, position_rad)
+    backward = _motion(axes, velocity[::-1], position_rad[::-1])
+    try:
+        columns = columns_at(placed.effect, onward, placed.axis)
+        reversed_columns = columns_at(placed.effect, backward, placed.axis)
+    except EffectRefused:
+        return None
+    if not np.allclose(columns, reversed_columns[:, ::-1]):
+        return None
+    return columns
 
 
 def _friction_at(
@@ -230,7 +272,7 @@ def _friction_at(
         positions_rad: shape (p,).
 
     Returns:
-        v · p values of f.
+        v · p values of f; none where an effect is no function of velocity and position.
     """
     estimate = evidence.estimate
     unknowns = np.concatenate((estimate.gains, estimate.parameters))
@@ -248,9 +290,10 @@ def _friction_at(
     viscous = gain_count + np.array(declared.viscous)
     weights[:, dry] = 1.0
     weights[:, viscous] = np.abs(velocity)[:, None]
-    motion = _motion(len(estimate.gains), velocity, position_rad)
     for placed in effects:
-        columns = columns_at(placed.effect, motion, axis)
+        columns = _columns_of(placed, len(estimate.gains), velocity, position_rad)
+        if columns is None:
+            return []
         weights[:, indices(placed)] = (np.sign(velocity) * columns).T
     torque = weights @ unknowns
     variance = np.einsum("kp,pq,kq->k", weights, estimate.covariance, weights, optimize=True)

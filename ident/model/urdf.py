@@ -659,7 +659,9 @@ def _joint(element: Element, at: Place) -> Joint:
     lowest: float | None = None
     travel: float | None = None
     limits = _position_limits(element)
-    if limits is not None and limits.range is not None:
+    # Exporters leave a bound out where a joint has none: only a follower's range is guarded.
+    is_read = limits is not None and (limits.are_whole or element.find("mimic") is not None)
+    if limits is not None and is_read and limits.range is not None:
         lowest, highest = limits.range
         travel = highest - lowest
     return Joint(
@@ -678,8 +680,13 @@ def _joint(element: Element, at: Place) -> Joint:
 class PositionLimits:
     """Limits of a joint as its URDF writes them; a bound that is left out is 0, as URDF says."""
 
-    lower: str
-    upper: str
+    lower: str | None
+    upper: str | None
+
+    @property
+    def are_whole(self) -> bool:
+        """Whether the URDF has both bounds."""
+        return self.lower is not None and self.upper is not None
 
     @property
     def range(self) -> tuple[float, float] | None:
@@ -697,13 +704,21 @@ class PositionLimits:
         return not lower <= upper
 
     def _numbers(self) -> tuple[float, float]:
+        lower = "0" if self.lower is None else self.lower
+        upper = "0" if self.upper is None else self.upper
         try:
-            return float(self.lower), float(self.upper)
+            return float(lower), float(upper)
         except ValueError:
             return nan, nan
 
     def __str__(self) -> str:
-        return f"lower={self.lower!r} and upper={self.upper!r}"
+        lower = "no lower (0)"
+        if self.lower is not None:
+            lower = f"lower={self.lower!r}"
+        upper = "no upper (0)"
+        if self.upper is not None:
+            upper = f"upper={self.upper!r}"
+        return f"{lower} and {upper}"
 
 
 def position_limits_of(urdf: str) -> dict[str, PositionLimits]:
@@ -725,9 +740,7 @@ def _position_limits(element: Element) -> PositionLimits | None:
     limit = element.find("limit")
     if limit is None or element.get("type") == "continuous":
         return None
-    lower = limit.get("lower", "0")
-    upper = limit.get("upper", "0")
-    return PositionLimits(lower, upper)
+    return PositionLimits(limit.get("lower"), limit.get("upper"))
 
 
 def _effort_limit(element: Element) -> float:

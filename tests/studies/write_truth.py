@@ -76,14 +76,18 @@ def _subject_as_before(found: re.Match[str], facts: Facts) -> bool:
 
 
 def _subject_missing(found: re.Match[str], facts: Facts) -> bool:
-    """Hold where there is neither a file nor a folder of that name."""
+    """Hold where there is neither a file nor a folder of that name, or a change of it was begun and
+    not made: a later entry of the same command may have made it.
+    """
     subject = Path(found["subject"])
-    return not any(path.is_relative_to(subject) for path in facts.after)
+    is_there = any(path.is_relative_to(subject) for path in facts.after)
+    return not is_there or subject in facts.not_made
 
 
 def _subject_empty(found: re.Match[str], facts: Facts) -> bool:
-    """Hold where there is a file without content."""
-    return facts.after.get(Path(found["subject"])) == b""
+    """Hold where there is a file without content, or as `_subject_missing`."""
+    subject = Path(found["subject"])
+    return facts.after.get(subject) == b"" or subject in facts.not_made
 
 
 def _written_with_backup(found: re.Match[str], facts: Facts) -> bool:

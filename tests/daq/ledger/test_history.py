@@ -812,7 +812,7 @@ def test_gains_that_cannot_be_read_in_a_changed_log_are_not_called_absent(
     capsys.readouterr()
     assert _history(cell_file, *arguments) == 4
     refused = _one_spaced(capsys.readouterr().err)
-    assert "changed lines, which may have one" in refused
+    assert "changed lines may have one" in refused
     assert "drivegain history CELL --verify" in refused
     assert "--add" not in refused
     assert path.read_bytes() == changed

@@ -548,7 +548,7 @@ def test_verify_of_a_torn_noted_entry_names_it_before_and_after_the_next_entry(
         assert "chain BROKEN" in printed
         assert "They are no flaw" not in printed
         assert lost[:12] in error_output
-        assert "a power failure" in error_output
+        assert "A power failure" in error_output
         assert "trust the controller's file" not in error_output
         later = calibration_for(cell_file, factor)
         assert run_verb("history", cell_file, "--add", later) == ExitCode.OK

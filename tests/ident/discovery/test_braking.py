@@ -224,6 +224,39 @@ class RunOut(Effect):
         return np.asarray(size * np.sign(signals.velocity_rad_s[axis]))
 
 
+@dataclass(frozen=True, slots=True)
+class SlowStart(Effect):
+    """Friction that depends on what came before a sample, and needs a load.
+
+    τ = sign(q̇) · τ_L/|τ_L| at odd samples.
+    """
+
+    name = "slow-start"
+    declares = Property.ODD_IN_VELOCITY
+    abscissa = Abscissa.VELOCITY
+    coefficients = (Column("a", "Nm"),)
+
+    needs_load: bool = False
+
+    def columns(self, signals: Signals, axis: int) -> FloatArray:
+        """Columns, shape (1, k)."""
+        own = np.sign(signals.velocity_rad_s[axis])
+        own[::2] = 0.0
+        if self.needs_load:
+            with np.errstate(invalid="ignore"):
+                own = own * signals.load_torque_nm[axis] / np.abs(signals.load_torque_nm[axis])
+        return np.asarray(own)[None]
+
+
+@pytest.mark.parametrize("needs_load", [False, True])
+def test_an_effect_that_is_no_function_of_speed_and_position_is_not_judged(
+    clean: Evidence, needs_load: bool
+) -> None:
+    effect = SlowStart(needs_load)
+    fitted = with_effects(clean, (PlacedEffect(effect, AXIS),))
+    assert describe_driving_friction(fitted, AXIS) == ""
+
+
 @pytest.mark.parametrize("effect", [PositionFriction(), RunOut()])
 def test_friction_that_pushes_at_a_position_is_named_with_that_position(
     clean: Evidence, truth: Truth, effect: Effect
