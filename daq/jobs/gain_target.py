@@ -90,13 +90,15 @@ def target_of(cell: Cell) -> GainTarget:
         ConfigurationInconsistent: the cell names neither a controller's file nor objects in its
             drives.
         ControllerUnfit: the file is a symbolic link that a write would not follow
-            (`daq.writeback.file_access`).
+            (`daq.writeback.file_access`), or it lacks a gain.
     """
     controller = cell.controller
     file = cell.controller_path
     if controller is not None and cell.history is not None:
         if file is not None and controller.gains:
-            resolve_links(file)  # refused now, not after an hour of recordings
+            # Refused now, not after an hour of recordings
+            resolve_links(file)
+            FileTarget.of(cell, file).require_gains()
             return GainTarget(cell, cell.history, file)
         if controller.objects:
             return GainTarget(cell, cell.history, None)
@@ -124,5 +126,7 @@ def file_of(cell: Cell) -> GainTarget:
             remedy="name it in the cell file; `drivegain calibrate` writes what is in drives, with "
             "an operator",
         )
-    resolve_links(cell.controller_path)  # refused now, not after an hour of recordings
+    # Refused now, not after an hour of recordings
+    resolve_links(cell.controller_path)
+    FileTarget.of(cell, cell.controller_path).require_gains()
     return GainTarget(cell, cell.history, cell.controller_path)

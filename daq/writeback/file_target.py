@@ -187,16 +187,12 @@ class FileTarget:
     def plan(self, calibration: Calibration) -> FileEdit:
         """See `Target.plan`."""
         require_axes(calibration, self.keys)
-        self._require_distinct_keys()
-        require_existing(self.file)
-        content = read_controller_file(self.file)
-        document = decode_document(content, str(self.file), self.format)
-        keys = tuple(self.keys[gain.axis] for gain in calibration.gains)
-        scalars = document.locate(keys)
+        axes = tuple(gain.axis for gain in calibration.gains)
+        document, scalars = self._located(axes)
+        content = document.content
         changes = []
         for gain, scalar in zip(calibration.gains, scalars, strict=True):
             changes.append(self._change_of(gain, scalar))
-        self._require_distinct_numbers(scalars)
         new_numbers = {}
         for change in changes:
             if change.spelling:
@@ -212,6 +208,29 @@ class FileTarget:
             file=self.file,
             format=self.format,
         )
+
+    def require_gains(self) -> None:
+        """Refuse a file that cannot be read, or that lacks the gain of an axis; nothing is written.
+
+        Raises:
+            ControllerUnfit: it is such a file.
+        """
+        self._located(tuple(self.keys))
+
+    def _located(self, axes: tuple[str, ...]) -> tuple[ControllerDocument, tuple[Scalar, ...]]:
+        """Read the file, and find the numbers of the gains of some axes.
+
+        Raises:
+            ControllerUnfit: the file cannot be read, a gain is not there, or two axes have one.
+        """
+        self._require_distinct_keys()
+        require_existing(self.file)
+        content = read_controller_file(self.file)
+        document = decode_document(content, str(self.file), self.format)
+        keys = tuple(self.keys[axis] for axis in axes)
+        scalars = tuple(document.locate(keys))
+        self._require_distinct_numbers(scalars)
+        return document, scalars
 
     def _require_distinct_keys(self) -> None:
         """Refuse a key of the file that two axes have.

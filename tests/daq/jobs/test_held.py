@@ -39,6 +39,7 @@ from daq.errors import (
     exit_code,
 )
 from daq.jobs.context import section_of
+from daq.jobs.gain_target import file_of, target_of
 from daq.jobs.job import Preview, preview, time_bound
 from daq.jobs.journal import Form, Journal
 from daq.ledger.audit import AuditAction, append
@@ -896,6 +897,23 @@ def test_preflight_a_controllers_folder_that_is_read_only_holds_a_job_that_write
     assert "read-only file system" in str(refused)
     assert "nothing has moved" in str(refused)
     assert asked_drives == []
+
+
+def test_a_gain_that_the_controllers_file_lacks_is_said_before_anything_moves(
+    tmp_path: Path, short_plan: Path
+) -> None:
+    """A key that is misspelt was found after the recordings."""
+    rig = make_rig(made_folder(tmp_path), short_plan)
+    asked_drives = without_drives(rig)
+    content = rig.controller.read_text()
+    rig.controller.write_text(content.replace("gain:", "gein:", 1))
+    for find in (target_of, file_of):
+        with pytest.raises(ControllerUnfit, match="gain"):
+            find(rig.cell)
+    with pytest.raises(ControllerUnfit, match="gain"):
+        rig.job()
+    assert asked_drives == []
+    assert rig.sessions == ()
 
 
 def test_preflight_a_job_that_only_proposes_needs_no_place_in_the_controllers_folder(
