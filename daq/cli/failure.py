@@ -145,8 +145,7 @@ The nearest base class of an error counts.
 
 _NO_POWER = (
     "axes that keep their supply and their power from the first SYNC to the last",
-    "check the drive's supply and the safety chain (STO, emergency stop, enable), then repeat "
-    "the command",
+    "check the drive's supply and the safety chain (STO, doors, enable), then repeat the command",
 )
 """Of an axis that booted again, fell silent or lost its power, and reported neither error nor
 fault.

@@ -853,7 +853,10 @@ def test_a_bag_is_imported_with_its_joints_as_axes(checkout: Path, tmp_path: Pat
     [
         (None, r"nowhere: found no such file .*; expected a CSV or MATLAB file, or a ROS bag"),
         (b"PAR1" + bytes(20), "nowhere: found a Parquet file; expected a CSV or MATLAB file, or"),
-        (b"J1,J2\n1,2\n", "which is also position.columns.*nowhere is to be a bag.*is no bag"),
+        (
+            b"J1,J2\n1,2\n",
+            "which is also position.columns.*nowhere is read as a CSV file.*is no bag",
+        ),
     ],
     ids=["missing", "parquet", "text"],
 )
