@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from daq.errors import ControllerUnfit
-from daq.formats.scalar import CORRECT_KEY, ControllerDocument, KeyPath, Scalar, Values, utf8
+from daq.formats.scalar import ControllerDocument, KeyPath, Scalar, Values, utf8
 
 MAX_DEPTH = 100
 _BYTE_ORDER_MARK = "\ufeff"
@@ -122,14 +122,12 @@ class JsonDocument(ControllerDocument):
                 }
                 names -= {"{}", "[]"}
                 has = ", ".join(sorted(names)[:12]) or "nothing"
-                raise self.unfit(
-                    key, f"no key {path[depth]!r} in {place} (it has {has})", CORRECT_KEY
-                )
+                raise self.lacking(key, f"no key {path[depth]!r} in {place} (it has {has})")
             if parent in tokens:
                 break
         *parents, last = path
         place = ".".join(parents) or "the file"
-        raise self.unfit(key, f"no key {last!r} in {place}", CORRECT_KEY)
+        raise self.lacking(key, f"no key {last!r} in {place}")
 
 
 @dataclass(frozen=True, slots=True)

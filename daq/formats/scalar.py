@@ -7,6 +7,7 @@ is read back and compared.
 
 from __future__ import annotations
 
+import difflib
 import math
 import re
 from abc import ABC, abstractmethod
@@ -258,6 +259,18 @@ class ControllerDocument(ABC):
         place = f"{self.name}: {key}"
         remedy = f"{remedy}; nothing was written"
         return ControllerUnfit(place, found=found, expected=expected, remedy=remedy)
+
+    def lacking(self, key: str, found: str) -> ControllerUnfit:
+        """Make the error for a dotted key that the file lacks; it names the nearest one there is.
+
+        Where names of the file have dots, what was found at one step says little.
+        """
+        names = [".".join(path) for path in _paths(self)]
+        nearest = difflib.get_close_matches(key, names, n=1)
+        remedy = CORRECT_KEY
+        if nearest:
+            remedy = f"{CORRECT_KEY}: the nearest key is {nearest[0]}"
+        return self.unfit(key, found, remedy)
 
     def decimal_scalar(self, key: str, text: str, start: int, line: int) -> Scalar:
         """Return a decimal number of the text.

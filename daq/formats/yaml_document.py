@@ -17,7 +17,6 @@ from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 from daq.config.yaml_file import yaml_events
 from daq.errors import ControllerUnfit
 from daq.formats.scalar import (
-    CORRECT_KEY,
     DECIMAL,
     OCTAL,
     ControllerDocument,
@@ -113,7 +112,7 @@ class YamlDocument(ControllerDocument):
                 child: Node = node.value[position]
                 return child
         if not isinstance(node, MappingNode):
-            raise self.unfit(key, f"no key {step!r} in {place}", CORRECT_KEY)
+            raise self.lacking(key, f"no key {step!r} in {place}")
         named = [(name.value, value) for name, value in node.value if isinstance(name, ScalarNode)]
         found: list[Node] = [value for name, value in named if name == step]
         if len(found) > 1:
@@ -124,7 +123,7 @@ class YamlDocument(ControllerDocument):
                 text = f"no {step!r} of its own in {place}, which merges (<<) another"
                 raise self.unfit(key, text, "write it out")
             has = ", ".join(names[:12]) or "nothing"
-            raise self.unfit(key, f"no key {step!r} in {place} (it has {has})", CORRECT_KEY)
+            raise self.lacking(key, f"no key {step!r} in {place} (it has {has})")
         return found[0]
 
 

@@ -902,6 +902,22 @@ def test_a_real_data_sheet_has_no_value_to_change(shared_data: Path, name: str) 
 
 
 @pytest.mark.parametrize(
+    ("content", "kind"),
+    [
+        ('{"ros.params": {"gains": {"J1": 1.5, "J2": 2.5}}}', ControllerFormat.JSON),
+        ("ros.params:\n  gains: {J1: 1.5, J2: 2.5}\n", ControllerFormat.YAML),
+    ],
+)
+def test_a_key_that_is_misspelt_is_answered_by_the_nearest_one(
+    content: str, kind: ControllerFormat
+) -> None:
+    """Names of the file have dots: no step of the key says what is wrong with it."""
+    document = in_format(content.encode(), kind)
+    assert "the nearest key is ros.params.gains.J1;" in refusal(document, "ros.params.gain.J1")
+    assert "nearest" not in refusal(document, "speed")
+
+
+@pytest.mark.parametrize(
     ("name", "kind"),
     [
         ("a.yaml", ControllerFormat.YAML),
