@@ -337,8 +337,15 @@ class OutputFailed(DaqError):
     """The disk is full, or the folder is read-only."""
 
     @classmethod
-    def of(cls, path: Path, error: OSError) -> OutputFailed:
-        """Make the error for a file that was replaced whole or not at all."""
+    def of(cls, path: Path, error: OSError, *, state: str = "") -> OutputFailed:
+        """Make the error for a file that was replaced whole or not at all.
+
+        Args:
+            path: of the file.
+            error: of the system.
+            state: what the file is now, in words; by default whether it is as it was.
+        """
+        state = state or _state_after(path)
         if isinstance(error, WriteUnconfirmed):
             return cls(
                 str(path),
@@ -352,8 +359,7 @@ class OutputFailed(DaqError):
                 found=reason_of(error),
                 expected="a user who may keep owner and group of the file, so that who reads it "
                 "now can read it then",
-                remedy=f"{_state_after(path)}; "
-                "run the command as its owner and in its group (`sudo -u`, "
+                remedy=f"{state}; run the command as its owner and in its group (`sudo -u`, "
                 "or `usermod -aG` and a new login), or give the file to this user (`chown`, "
                 "`chgrp`) if the controller can read it then",
             )
@@ -362,7 +368,7 @@ class OutputFailed(DaqError):
                 str(path),
                 found=error.reason,
                 expected="a file that may be replaced",
-                remedy=f"{_state_after(path)}; ask who set the mark and why, take it off "
+                remedy=f"{state}; ask who set the mark and why, take it off "
                 f"(`chattr -i -a {shlex.quote(str(error.marked))}`), then repeat the command",
             )
         missing = cls.of_missing_folder(path, error)
@@ -374,13 +380,13 @@ class OutputFailed(DaqError):
                 found=reason_of(error),
                 expected="a name that the file system takes, with the endings of its temporary "
                 "files",
-                remedy=f"{_state_after(path)}; choose a shorter name",
+                remedy=f"{state}; choose a shorter name",
             )
         return cls(
             str(path),
             found=reason_of(error),
             expected="a folder that can be written, with room",
-            remedy=f"{_state_after(path)}; free space or rights, or choose another folder",
+            remedy=f"{state}; free space or rights, or choose another folder",
         )
 
     @classmethod

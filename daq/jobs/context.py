@@ -544,7 +544,7 @@ def _reporting_refusals(place: Path, expected: str) -> Iterator[None]:
         missing = OutputFailed.of_missing_folder(place, error)
         if missing is not None:
             raise missing from error
-        refused = OutputFailed.of(place, error)
+        refused = OutputFailed.of(place, error, state="nothing has moved")
         found = refused.found
         failing_path = error.filename
         if failing_path is not None and str(failing_path) != str(place):
@@ -553,7 +553,7 @@ def _reporting_refusals(place: Path, expected: str) -> Iterator[None]:
             refused.subject,
             found=found,
             expected=expected,
-            remedy=f"nothing has moved; {refused.remedy}",
+            remedy=refused.remedy,
         ) from error
 
 
