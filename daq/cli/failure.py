@@ -372,6 +372,10 @@ def _parts(error: Exception, verb: str) -> tuple[str, str, str, str]:
             return error.found, error.found, error.expected, error.remedy
     expected, remedy = _advice_for_evidence(error, verb) or _advice(type(error), verb)
     message = str(error)
+    if isinstance(error, driver.DriveFault):
+        own_remedy = getattr(error, "remedy", "")
+        if own_remedy and own_remedy == remedy:
+            message = message.removesuffix(f"; {own_remedy}")
     if verb == "demo":
         message = message.replace(RESET, "")
     return message, message, expected, remedy

@@ -33,12 +33,14 @@ from drivers.simulation.spec import CellSpec, SdoAbort, SpecInvalid
 from tests.daq.console.feeds import arrivals
 from tests.faults.cells import CONFIGS
 
+# The wrist's motors are coupled: with opposite angles of J5 and J6, motor 6 would stand still, and
+# a fault of its data in motion could not be seen.
 PLAN = """format: drivegain-plan
 cell: demo
 seed: 1
 condition: 100.0
 moves:
-  - {target_deg: [20, -20, 70, 20, -20, 20], velocity: 0.5, acceleration: 0.5, dwell_s: 0.01}
+  - {target_deg: [20, -20, 70, 20, -20, -20], velocity: 0.5, acceleration: 0.5, dwell_s: 0.01}
   - {target_deg: [0, 0, 90, 0, 0, 0], velocity: 0.5, acceleration: 0.5, dwell_s: 0.01}
 """
 

@@ -259,6 +259,7 @@ def test_remedy_of_a_fault_with_a_code_explains_it() -> None:
 def test_remedy_of_a_fault_that_has_its_own_is_that_one() -> None:
     failure = ErrorParts.of(DriveFault(3, "a limit", 0x0237, remedy="use slower moves"), "record")
     assert failure.do == "use slower moves"
+    assert "use slower moves" not in failure.error
 
 
 def test_remedy_of_a_lost_sample_after_an_error_is_about_that_error() -> None:
