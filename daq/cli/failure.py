@@ -147,7 +147,7 @@ _NO_POWER = (
     "axes that keep their supply and their power from the first SYNC to the last",
     "check the drive's supply and the safety chain (STO, doors, enable), then repeat the command",
 )
-"""Of an axis that booted again, fell silent or lost its power, and reported neither error nor
+"""Of an axis that booted again, stopped answering or lost its power, and reported neither error nor
 fault.
 """
 _FAULT_WITHOUT_CODE = (
@@ -373,9 +373,8 @@ def _parts(error: Exception, verb: str) -> tuple[str, str, str, str]:
     expected, remedy = _advice_for_evidence(error, verb) or _advice(type(error), verb)
     message = str(error)
     if isinstance(error, driver.DriveFault):
-        own_remedy = getattr(error, "remedy", "")
-        if own_remedy and own_remedy == remedy:
-            message = message.removesuffix(f"; {own_remedy}")
+        # The message of the library ends with the remedy, which has a line of its own here.
+        message = message.removesuffix(f"; {remedy}")
     if verb == "demo":
         message = message.replace(RESET, "")
     return message, message, expected, remedy
@@ -420,7 +419,7 @@ def _advice_for_evidence(error: Exception, verb: str) -> tuple[str, str] | None:
     if verb == "demo":
         return None
     if isinstance(error, driver.SampleLost | driver.StateRefused):
-        if any(getattr(error, "reported", ())):
+        if any(error.reported):
             return _ERROR_REPORTED
     elif isinstance(error, driver.DriveFault):
         return _advice_for_fault(error, verb)
@@ -429,16 +428,13 @@ def _advice_for_evidence(error: Exception, verb: str) -> tuple[str, str] | None:
 
 def _advice_for_fault(error: driver.DriveFault, verb: str) -> tuple[str, str] | None:
     """Return expected and remedy of a fault that has no code of an EMCY; None for one with it."""
-    # Errors that were made without their constructor lack these fields.
-    code = getattr(error, "emcy_code", None)
-    statusword = getattr(error, "statusword", None)
-    remedy = getattr(error, "remedy", "")
-    if code is not None:
+    if error.emcy_code is not None:
         return None
-    if remedy:
+    if error.remedy:
         expected, _ = _advice(type(error), verb)
-        return expected, remedy
-    if statusword is not None and statusword & (STATUS_FAULT | STATUS_FOLLOWING_ERROR):
+        return expected, error.remedy
+    fault_bits = STATUS_FAULT | STATUS_FOLLOWING_ERROR
+    if error.statusword is not None and error.statusword & fault_bits:
         return _FAULT_WITHOUT_CODE
     return _NO_POWER
 

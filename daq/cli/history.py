@@ -158,7 +158,7 @@ def history_verb(
     if add is not None:
         _add(ledger, add, who, now)
     needed = (acknowledge, axis)
-    checked, history, all_series = _read(ledger, verify, needed, is_drawn=plot is not None)
+    checked, history, all_series = _read(ledger, verify, needed, needs_any_gain=plot is not None)
     if acknowledge is not None:
         _acknowledge(ledger, _named(all_series, acknowledge, declared), who, why, since, now)
         checked, history, all_series = _read(ledger, verify)
@@ -228,7 +228,7 @@ def _require_log(ledger: Ledger, checked: Verification) -> None:
 
 
 def _read(
-    ledger: Ledger, verify: bool, axes: Sequence[str | None] = (), *, is_drawn: bool = False
+    ledger: Ledger, verify: bool, axes: Sequence[str | None] = (), *, needs_any_gain: bool = False
 ) -> tuple[Verification | None, History, tuple[Series, ...]]:
     """Read the history and the chart of each gain, from a verification if that is wanted.
 
@@ -236,7 +236,7 @@ def _read(
         ledger: of the cell.
         verify: check it.
         axes: whose gains are needed.
-        is_drawn: a gain of any axis is needed.
+        needs_any_gain: a gain of any axis is needed.
     """
     from daq.ledger.ledger import read_history
     from daq.ledger.watch import watch
@@ -245,7 +245,7 @@ def _read(
     history = read_history(ledger) if checked is None else checked.history
     all_series = watch(history.entries, history.acknowledgements)
     if history.may_lack:
-        _require_gains(ledger, checked, all_series, axes, is_drawn=is_drawn)
+        _require_gains(ledger, checked, all_series, axes, needs_any_gain=needs_any_gain)
     return checked, history, all_series
 
 
@@ -255,7 +255,7 @@ def _require_gains(
     all_series: tuple[Series, ...],
     axes: Sequence[str | None],
     *,
-    is_drawn: bool,
+    needs_any_gain: bool,
 ) -> None:
     """Refuse to call gains absent that a changed audit log may have; args as of `_read`."""
     from daq.ledger.ledger import audit_error
@@ -264,7 +264,7 @@ def _require_gains(
     missing = [axis for axis in axes if axis in ledger.cell.axis_names and axis not in known]
     if missing:
         found = f"no identified gain of {missing[0]}"
-    elif is_drawn and not known:
+    elif needs_any_gain and not known:
         found = "no identified gain"
     else:
         return

@@ -147,7 +147,7 @@ def simulate(
         if hub_port is not None:
             hub = stack.enter_context(Hub(tuple(nodes_by_bus), hub_port))
             addresses = {name: hub.address(name) for name in nodes_by_bus}
-        else:  # a hub is a bus of this program, on which nobody is yet
+        else:  # a hub is a bus of this program, which no other program uses yet
             require_untaken(addresses.values())
         parts = tuple(BusPart(name, addresses[name], nodes) for name, nodes in nodes_by_bus.items())
         address: CellAddress = parts[0].address

@@ -146,9 +146,8 @@ class Section:
 class PublishedColumns(Section):
     """Columns of a quantity that a bag has, too."""
 
-    topic: Topic | None = (
-        None  #: topic of these columns in a bag; that of the description by default
-    )
+    #: topic of these columns in a bag; that of the description by default
+    topic: Topic | None = None
     #: their publisher; that of the description by default
     publisher: Annotated[int, Field(ge=1)] | None = None
 
@@ -318,9 +317,8 @@ class ImportDescription(StrictModel):
     time: TimeColumn | None = None  #: the time column, instead of a rate
     keep: KeptPart | None = None  #: part of the recording that is imported; all of it by default
     holdout: HoldoutPart | None = None  #: end of it that becomes a second log
-    topic: Topic | None = (
-        None  #: topic of the joint states in a ROS 2 bag; needed if it has several
-    )
+    #: topic of the joint states in a ROS 2 bag; needed if it has several
+    topic: Topic | None = None
     #: Which publisher of that topic, by the number that an import names; needed if several publish
     #: the same joints.
     publisher: Annotated[int, Field(ge=1)] | None = None

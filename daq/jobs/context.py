@@ -343,8 +343,8 @@ class SessionContext:
     journal: Journal  #: log of the session, labelled with session and stage
     began_s: float = 0.0  #: start on the monotonic clock [s]
     block_signals: SignalBlocker = nullcontext  #: keeps signals away while the axes are stopped
-    #: Whether nobody but this session can write the gains. A job may only propose them, and after
-    #: a guided session another person may apply them.
+    #: Whether the gains are lost work if this session cannot write them: those of a job that
+    #: writes. Another person may apply those of a guided session, or of a job that only proposes.
     must_write: bool = False
 
     @property
@@ -501,7 +501,7 @@ def nearest_existing_folder(folder: Path) -> Path:
 
 def require_writable(context: SessionContext) -> None:
     """Check that the session can write what it will write after the recordings:
-    its folder, the audit log, and the controller's file if nobody else writes the gains.
+    its folder, the audit log, and the controller's file if it must write the gains.
 
     What it makes to try that is removed again.
 

@@ -96,9 +96,7 @@ def target_of(cell: Cell) -> GainTarget:
     file = cell.controller_path
     if controller is not None and cell.history is not None:
         if file is not None and controller.gains:
-            # Refused now, not after an hour of recordings
-            resolve_links(file)
-            FileTarget.of(cell, file).require_gains()
+            _require_gains_in(cell, file)
             return GainTarget(cell, cell.history, file)
         if controller.objects:
             return GainTarget(cell, cell.history, None)
@@ -108,6 +106,16 @@ def target_of(cell: Cell) -> GainTarget:
         expected="the place of the gains: a session compares its gains with those there",
         remedy="name it in the cell file (docs/how-to/write-gains.md)",
     )
+
+
+def _require_gains_in(cell: Cell, file: Path) -> None:
+    """Refuse a controller's file now, not after an hour of recordings.
+
+    Raises:
+        ControllerUnfit: it is a symbolic link that a write would not follow, or lacks a gain.
+    """
+    resolve_links(file)
+    FileTarget.of(cell, file).require_gains()
 
 
 def file_of(cell: Cell) -> GainTarget:
@@ -126,7 +134,5 @@ def file_of(cell: Cell) -> GainTarget:
             remedy="name it in the cell file; `drivegain calibrate` writes what is in drives, with "
             "an operator",
         )
-    # Refused now, not after an hour of recordings
-    resolve_links(cell.controller_path)
-    FileTarget.of(cell, cell.controller_path).require_gains()
+    _require_gains_in(cell, cell.controller_path)
     return GainTarget(cell, cell.history, cell.controller_path)

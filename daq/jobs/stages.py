@@ -40,7 +40,7 @@ class Record:
     """Record the runs that the schedule asks for."""
 
     def run(self, context: SessionContext, session: Session) -> Session:
-        """Check disk, history, interlock and drives, then record;
+        """Check disk, places to write to, history, interlock and drives, then record;
         nothing is checked where nothing is left.
         """
         session = verified_runs(session)

@@ -15,6 +15,7 @@ from tempfile import TemporaryDirectory
 
 import zstandard
 
+from daq.config.foreign_files import HEAD_BYTES
 from daq.config.yaml_file import MAGIC_OF_LOGS
 from daq.errors import (
     LogCorrupt,
@@ -29,7 +30,7 @@ from daq.files import open_regular
 from daq.log.container import LARGEST_CHUNK, LARGEST_RATIO, LARGEST_RECORD, MAGIC
 from daq.log.mcap_bag import ZSTD_MAGIC, BagMessage, McapBag, Topic
 from daq.log.message import JOINTS_SCHEMA
-from daq.log.ros1_bag import ROS_1_MAGIC, Ros1Bag
+from daq.log.ros1_bag import ROS_1_MAGIC, Ros1Bag, more_behind
 from daq.log.table import kind_of_content
 
 SQLITE_MAGIC = b"SQLite format 3\0"
@@ -106,16 +107,8 @@ class SqliteBag:
             size = os.fstat(stream.fileno()).st_size
             stream.seek(end)
             is_another = stream.read(len(SQLITE_MAGIC)) == SQLITE_MAGIC
-        if not is_another:
-            return
-        behind = counted(size - end, "byte")
-        raise LogCorrupt(
-            str(self.path),
-            found=f"{behind} behind its end, which begin as another bag does",
-            expected="one bag",
-            remedy="files joined by `cat` are no bag: give each recording by itself; the first one "
-            f"alone is `head -c {end}` of the file",
-        )
+        if is_another:
+            raise more_behind(self.path, end, size, is_bag=True)
 
     def _count_steps(self) -> bool:
         """Count; SQLite stops at True."""
@@ -245,9 +238,11 @@ def _refuse_other_kind(path: Path, source: Path, head: bytes) -> None:
 
 
 def first_bytes(path: Path) -> bytes:
-    """Return the first 16 bytes of a file, none if it cannot be read: its reader reports that."""
+    """Return the first bytes of a file, by which its kind is known; none if it cannot be read: its
+    reader reports that.
+    """
     with suppress(OSError), open_regular(path) as stream:
-        return stream.read(16)
+        return stream.read(HEAD_BYTES)
     return b""
 
 

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from daq.config.foreign_files import HEAD_BYTES
 from daq.config.import_description import Column, ImportDescription, TimeColumn, TimeUnit
 from daq.errors import TableUnfit, counted, first_few, on_one_line
 from daq.files import read_regular
@@ -50,7 +51,6 @@ LARGEST_BYTES = 2**31 - 1  #: Largest file and variable; the format has no large
 LARGEST_RATIO = 200
 SMALL_BYTES = 64 * 2**20
 _HEADER_BYTES = 128
-_SHOWN_BYTES = 20  #: Of a file of another kind, in a message
 _PEEK_BYTES = 4096  #: Class, dimensions and name of a variable are in its first bytes
 
 # Types of elements and classes of arrays, by their numbers in the format.
@@ -180,7 +180,7 @@ def _content(path: Path) -> memoryview:
         found = "a MATLAB file of format 7.3 (HDF5)"
         remedy = "in MATLAB: save('run.mat', 'q', 'i', 't', '-v7') with the names of your variables"
     else:
-        found, remedy = kind_of_content(content[:_SHOWN_BYTES])
+        found, remedy = kind_of_content(content[:HEAD_BYTES])
         remedy += "; of MATLAB or Octave, save the variables with -v7"
     raise TableUnfit(
         str(path),

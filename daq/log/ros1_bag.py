@@ -119,17 +119,7 @@ class Ros1Bag:
             if end >= size:
                 return
             is_bag = stream.read(len(ROS_1_MAGIC)) == ROS_1_MAGIC
-        behind = counted(size - end, "byte")
-        found = f"{behind} behind its end"
-        if is_bag:
-            found += ", which begin as another bag does"
-        raise LogCorrupt(
-            str(self.path),
-            found=found,
-            expected="one bag, which ends with its index",
-            remedy="files joined by `cat` are no bag: give each recording by itself; the first one "
-            f"alone is `head -c {end}` of the file",
-        )
+        raise more_behind(self.path, end, size, is_bag=is_bag)
 
     def _damaged(self, error: Exception) -> LogCorrupt:
         """Make the error for bytes at which the library fails."""
@@ -141,6 +131,28 @@ class Ros1Bag:
     def _broken(self, subject: str, found: str, expected: str) -> LogCorrupt:
         remedy = "copy it again from where it was recorded, or repair it: `rosbag reindex`"
         return LogCorrupt(subject, found=found, expected=expected, remedy=remedy)
+
+
+def more_behind(path: Path, end: int, size: int, *, is_bag: bool) -> LogCorrupt:
+    """Make the error for a file that goes on behind the end of its bag.
+
+    Args:
+        path: of the file.
+        end: bytes of the bag.
+        size: bytes of the file.
+        is_bag: another bag begins there.
+    """
+    behind = counted(size - end, "byte")
+    found = f"{behind} behind its end"
+    if is_bag:
+        found += ", which begin as another bag does"
+    return LogCorrupt(
+        str(path),
+        found=found,
+        expected="one bag",
+        remedy="files joined by `cat` are no bag: give each recording by itself; the first one "
+        f"alone is `head -c {end}` of the file",
+    )
 
 
 def _topic_of(connection: Any) -> Topic:

@@ -32,8 +32,8 @@ DPI = 130
 _PANEL_IN = (5.6, 2.0)
 _TITLE_AND_LEGEND_IN = 1.1
 
-# Without a home folder that can be written, it takes a temporary one, and says so in two lines that
-# nobody needs to act on.
+# Without a home folder that can be written, matplotlib takes a temporary one, and says so in two
+# lines that ask for nothing.
 logging.getLogger("matplotlib").setLevel(logging.ERROR)
 
 

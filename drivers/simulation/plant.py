@@ -249,7 +249,7 @@ class Plant:
         n = len(spec.axes)
         joints = self._model.nv
         if self.mechanism is None and joints != n:
-            raise SpecInvalid(f"{n} axes and a URDF of {joints} joints; they must be as many")
+            raise SpecInvalid(f"{n} axes and a URDF of {joints} joints; expected equal numbers")
 
     def _build_effects(self, spec: CellSpec, passive_joints: tuple[str, ...]) -> list[Effect | Lag]:
         """Build the undeclared effects; pivots with friction learn how they turn with the joints.

@@ -95,7 +95,7 @@ def describe_driving_friction(evidence: Evidence, axis: int) -> str:
     for declared in _declared_friction(evidence, axis):
         for direction in (1.0, -1.0):
             velocities = direction * largest_speed * SPEEDS
-            judged += _friction_at(evidence, axis, declared, effects, velocities, positions_rad)
+            judged += _friction_at(evidence, declared, effects, velocities, positions_rad)
     worst = min(judged, key=lambda friction: friction.largest_possible, default=None)
     if worst is None or worst.largest_possible >= 0.0:
         return ""
@@ -213,8 +213,8 @@ def _motion(axes: int, velocity: FloatArray, position_rad: FloatArray) -> Signal
         velocity: of each sample [rad/s; m/s of a prismatic joint], shape (k,).
         position_rad: of each sample, shape (k,).
     """
-    once_a_joint = (axes, 1)
-    positions_rad = np.tile(position_rad, once_a_joint)
+    repeats = (axes, 1)
+    positions_rad = np.tile(position_rad, repeats)
     nothing = np.zeros(positions_rad.shape)
     samples = np.arange(len(velocity), dtype=np.float64)
     return Signals(
@@ -222,7 +222,7 @@ def _motion(axes: int, velocity: FloatArray, position_rad: FloatArray) -> Signal
         time_s=samples,
         session_s=samples,
         position_rad=positions_rad,
-        velocity_rad_s=np.tile(velocity, once_a_joint),
+        velocity_rad_s=np.tile(velocity, repeats),
         acceleration_rad_s2=nothing,
         motor_position_rad=positions_rad,
         inertia_kg_m2=np.empty((axes, axes, 0)),
@@ -255,7 +255,6 @@ def _columns_of(
 
 def _friction_at(
     evidence: Evidence,
-    axis: int,
     declared: _Declared,
     effects: tuple[PlacedEffect, ...],
     velocities: FloatArray,
@@ -265,7 +264,6 @@ def _friction_at(
 
     Args:
         evidence: a joint fit.
-        axis: index.
         declared: its dry and viscous friction.
         effects: its effects of the speed and of the position.
         velocities: all of one sign, shape (v,).

@@ -32,16 +32,24 @@ def _all(root: type[Exception]) -> Iterator[type[Exception]]:
         yield from _all(child)
 
 
+def _made(kind: type[Exception], message: str, *, has_parts: bool = True) -> Exception:
+    """An error of any class: each has a constructor of its own."""
+    error = kind.__new__(kind)
+    error.args = (message,)
+    for name in ("subject", "found", "expected", "remedy", "address"):
+        part = name if has_parts else ""
+        object.__setattr__(error, name, part)
+    evidence: dict[str, object] = {"emcy_code": None, "statusword": None, "reported": ()}
+    for name, value in evidence.items():
+        object.__setattr__(error, name, value)
+    return error
+
+
 @pytest.mark.parametrize(
     "kind", [*_all(DriverError), *_all(IdentificationError)], ids=lambda kind: kind.__name__
 )
 def test_every_error_of_drivers_and_of_the_science_has_a_remedy(kind: type[Exception]) -> None:
-    error = kind.__new__(kind)
-    error.args = ("J3 (node 3): evidence",)
-    for name in ("subject", "found", "expected", "remedy"):  # those that carry the parts themselves
-        object.__setattr__(error, name, name)
-    if kind is BusError:
-        object.__setattr__(error, "address", "socketcan:can0")
+    error = _made(kind, "J3 (node 3): evidence")
     failure = ErrorParts.of(error)
     assert all((failure.error, failure.found, failure.expected, failure.do))
     for label in ("error", "expected", "do"):
@@ -55,10 +63,7 @@ def test_every_error_of_drivers_and_of_the_science_has_a_remedy(kind: type[Excep
 def test_an_error_of_the_demonstration_names_no_verb_that_needs_a_cell_file(
     kind: type[Exception],
 ) -> None:
-    error = kind.__new__(kind)
-    error.args = (f"J3 (node 3): fault; {remedy_of(0x8611)}",)
-    for name in ("subject", "found", "expected", "remedy", "address"):
-        object.__setattr__(error, name, name)
+    error = _made(kind, f"J3 (node 3): fault; {remedy_of(0x8611)}")
     failure = ErrorParts.of(error, "demo")
     assert failure.do
     assert "CELL" not in f"{failure.error} {failure.found} {failure.do}"
@@ -69,10 +74,7 @@ def test_an_error_of_the_demonstration_names_no_verb_that_needs_a_cell_file(
 def test_no_verb_that_asks_the_drives_advises_to_run_itself(
     kind: type[Exception], verb: str
 ) -> None:
-    error = kind.__new__(kind)
-    error.args = ("J3 (node 3): evidence",)
-    for name in ("address", "found", "remedy"):
-        object.__setattr__(error, name, "")
+    error = _made(kind, "J3 (node 3): evidence", has_parts=False)
     failure = ErrorParts.of(error, verb)
     assert failure.do
     pattern = rf"`drivegain {verb} CELL([^`]*)`"
