@@ -15,7 +15,7 @@ import numpy as np
 from scipy import linalg
 
 from ident.arrays import BoolArray, FloatArray, IntArray
-from ident.equations.linearisation import Folds, MotorRows
+from ident.equations.linearisation import CholeskyFactor, Folds, MotorRows
 
 #: Whitened columns of a candidate on the rows of each motor that it loads, (p, rows), by motor
 WhitenedColumns = Mapping[int, FloatArray]
@@ -254,7 +254,7 @@ def _fitted_together(
     return results
 
 
-def solved(factor: tuple[FloatArray, bool], right: FloatArray) -> FloatArray:
+def solved(factor: CholeskyFactor, right: FloatArray) -> FloatArray:
     """H⁻¹JᵀΦ of each candidate, transposed, from ΦᵀJ, both of shape (c, p, f)."""
     flat = right.reshape(-1, right.shape[-1])
     solution = linalg.cho_solve(factor, flat.T)

@@ -17,7 +17,7 @@ from scipy import linalg
 from ident.arrays import FloatArray
 from ident.effects.effect import Effect
 from ident.effects.signals import Abscissa
-from ident.equations.linearisation import RIDGE, Folds
+from ident.equations.linearisation import RIDGE, Folds, lower_factor
 
 FEWEST_MOVES = 3.0  #: Effective number of moves below which their random signs test nothing
 #: The same below which a candidate sets no limit for others, and is tested without those of most
@@ -102,7 +102,7 @@ def without_most_leverage(
     full_hessian = folds.motor_hessian.sum(axis=0)
     hessian = full_hessian - folds.cluster_hessian[left_out].sum(axis=0)
     ridge = RIDGE * np.diag(np.diag(full_hessian))
-    factor = linalg.cho_factor(hessian + ridge, lower=True)
+    factor = lower_factor(hessian + ridge)
     # w = H⁻¹ JᵀΦ and x = H⁻¹ Jᵀe of the clusters that are left.
     crossed_left = crossed[left]
     along = linalg.cho_solve(factor, crossed_left.sum(axis=0).T)

@@ -25,7 +25,14 @@ from ident.arrays import BoolArray, FloatArray, IntArray, require_count, require
 from ident.discovery.candidates import SMALLEST_SINGULAR, SearchProblem
 from ident.discovery.error_change import ErrorChange, change_of_errors, describe_noise
 from ident.effects.effect import Effect, PlacedEffect
-from ident.equations.linearisation import RIDGE, Folds, cut_into_folds, sum_of_squares
+from ident.equations.linearisation import (
+    RIDGE,
+    CholeskyFactor,
+    Folds,
+    cut_into_folds,
+    lower_factor,
+    sum_of_squares,
+)
 from ident.equations.observation import Observation
 from ident.errors import ModelError
 from ident.estimators.estimate import Estimate
@@ -252,7 +259,7 @@ def _can_be_left_out(observation: Observation, region: IntArray) -> tuple[int, .
 class _Others:
     """A fit of all parts but one."""
 
-    factor: tuple[FloatArray, bool]  #: Cholesky factor of JᵀJ
+    factor: CholeskyFactor  #: of JᵀJ
     score: FloatArray  #: Jᵀe, shape (f,)
 
 
@@ -514,7 +521,7 @@ def moved_gains(shifts: FloatArray, gains_std: FloatArray) -> tuple[tuple[int, f
     return tuple((motor, size) for motor, size in enumerate(sigmas.tolist()) if size > 1.0)
 
 
-def _factor(hessian: FloatArray, seen_by_all: FloatArray) -> tuple[FloatArray, bool]:
+def _factor(hessian: FloatArray, seen_by_all: FloatArray) -> CholeskyFactor:
     """Cholesky factor of JᵀJ; directions that the rows do not show stay where they are.
 
     Args:
@@ -523,4 +530,4 @@ def _factor(hessian: FloatArray, seen_by_all: FloatArray) -> tuple[FloatArray, b
         seen_by_all: diagonal of JᵀJ of all rows, positive, shape (f,).
     """
     regular = hessian + RIDGE * np.diag(seen_by_all)
-    return linalg.cho_factor(regular, lower=True)
+    return lower_factor(regular)

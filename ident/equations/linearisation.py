@@ -29,6 +29,9 @@ from ident.equations.run_scatter import RunScatter
 from ident.equations.system import System
 from ident.errors import TooFewMoves
 
+#: The lower Cholesky factor, with the flag that `scipy.linalg.cho_solve` asks for
+CholeskyFactor = tuple[FloatArray, bool]
+
 #: Fields of a linearisation with one entry a row
 LINEARISATION_ROWS = ("residual", "current", "motor", "cluster", "source")
 MIN_MOVES_TO_LEAVE_OUT = 8  #: With fewer, leaving one out shows little of the scatter
@@ -242,7 +245,7 @@ class Linearisation:
         """The same around the best fit of its rows, and the scaled step to it, shape (f,)."""
         hessian = sum_of_squares(self.jacobian)
         hessian[np.diag_indices_from(hessian)] *= 1.0 + RIDGE
-        factor = linalg.cho_factor(hessian, lower=True)
+        factor = lower_factor(hessian)
         score = self.jacobian.on_columns(self.residual)
         step = linalg.cho_solve(factor, score)
         residual = self.residual - self.jacobian @ step
@@ -442,10 +445,21 @@ def even_unit(hessian: FloatArray) -> FloatArray:
     return 1.0 / np.sqrt(squares)
 
 
+def lower_factor(matrix: FloatArray) -> CholeskyFactor:
+    """Lower Cholesky factor L of a positive definite matrix A = L Lᵀ of shape (f, f).
+
+    Raises:
+        scipy.linalg.LinAlgError: A is not positive definite.
+    """
+    # From scipy 1.18 on its flag is an array, before it a bool.
+    lower, _ = linalg.cho_factor(matrix, lower=True)
+    return lower, True
+
+
 def _solved(matrix: FloatArray, right: FloatArray) -> FloatArray:
     """Solution of A x = b by Cholesky's factorisation; by least squares where A is singular."""
     try:
-        factor = linalg.cho_factor(matrix, lower=True)
+        factor = lower_factor(matrix)
         return np.asarray(linalg.cho_solve(factor, right))
     except linalg.LinAlgError:  # a direction that only the cluster left out has seen
         solution, *_ = np.linalg.lstsq(matrix, right, rcond=None)
@@ -717,8 +731,8 @@ class Folds:
     moves: int
     blocks: tuple[tuple[slice, int, int, int], ...]  #: rows, fold, cluster and motor of each block
     motors: tuple[MotorRows, ...]  #: the same by motor, those without rows left out
-    full_factor: tuple[FloatArray, bool]  #: Cholesky factor of JᵀJ, with scipy's flag
-    factors: tuple[tuple[FloatArray, bool], ...]  #: the same without each fold
+    full_factor: CholeskyFactor  #: of JᵀJ
+    factors: tuple[CholeskyFactor, ...]  #: the same without each fold
     scores: FloatArray  #: Jᵀe without each fold, shape (folds, f)
     cluster_hessian: FloatArray  #: JᵀJ of each cluster, shape (clusters, f, f)
     cluster_score: FloatArray  #: Jᵀe of each cluster, shape (clusters, f)
@@ -729,7 +743,7 @@ class Folds:
     #: r, the e of each row predicted by a fit that did not see its fold, shape (rows,)
     residual: FloatArray
     #: Cholesky factor of the JᵀJ of the estimate, in which rows of a run share no errors.
-    estimate_factor: tuple[FloatArray, bool]
+    estimate_factor: CholeskyFactor
 
     @property
     def count(self) -> int:
@@ -777,14 +791,14 @@ def cut_into_folds(problem: Linearisation, move_of: IntArray | None = None) -> F
     score = sums.motor_score.sum(axis=0)
     # Two effects may be nearly equal: regularise the direction in which they differ.
     hessian[np.diag_indices_from(hessian)] *= 1.0 + RIDGE
-    factors: list[tuple[FloatArray, bool]] = []
+    factors: list[CholeskyFactor] = []
     scores_without: list[FloatArray] = []
     steps: list[FloatArray] = []
     for fold in range(FOLDS):
         hessian_without = hessian - by_fold[fold]
         # A direction that only this fold sees must not explode: it stays where all the data put it.
         hessian_without[np.diag_indices_from(hessian_without)] += RIDGE * np.diag(hessian)
-        factor = linalg.cho_factor(hessian_without, lower=True)
+        factor = lower_factor(hessian_without)
         own_score = sums.cluster_score[fold_of == fold].sum(axis=0)
         score_without = score - own_score
         factors.append(factor)
@@ -802,7 +816,7 @@ def cut_into_folds(problem: Linearisation, move_of: IntArray | None = None) -> F
         scores_of_motor = part_score[:, own.motor]  # a view, too
         scores_of_motor[:, own.seen] = own.by_fold(scores_of_blocks[..., 0], FOLDS)
     problem = _with_sorted_jacobian(problem, by_motor)
-    full_factor = linalg.cho_factor(hessian, lower=True)
+    full_factor = lower_factor(hessian)
     estimate_factor = full_factor
     if problem.scatter is not None:
         estimate_factor = _estimate_factor(problem, problem.scatter, hessian)
@@ -942,7 +956,7 @@ def _with_sorted_jacobian(problem: Linearisation, by_motor: Sequence[MotorRows])
 
 def _estimate_factor(
     problem: Linearisation, scatter: RunScatter, hessian: FloatArray
-) -> tuple[FloatArray, bool]:
+) -> CholeskyFactor:
     """Cholesky factor of J₀ᵀJ₀, with J = V^(−1/2) J₀ the decorrelated Jacobian.
 
     It is JᵀVJ = JᵀJ + Jᵀ(V − 1)J, and JᵀJ is known.
@@ -951,4 +965,4 @@ def _estimate_factor(
     of_estimate = hessian.copy()
     for motor, (part, seen) in enumerate(zip(jacobian.parts, jacobian.seen, strict=True)):
         of_estimate[np.ix_(seen, seen)] += scatter.shared(motor, part)
-    return linalg.cho_factor(of_estimate, lower=True)
+    return lower_factor(of_estimate)

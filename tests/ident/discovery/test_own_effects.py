@@ -27,6 +27,7 @@ pytestmark = pytest.mark.slow
 GATES = Gates(draws=199)
 COSINE_NM = 9.0
 SINE_NM = -6.0
+DRY_NM = 12.0  #: more than the lobes are high: friction brakes everywhere
 LOBES = 2.7
 COARSE_LOBES = (1.5, 4.0, 9.0)
 
@@ -58,7 +59,7 @@ def _lobed(data: Dataset) -> FloatArray:
     position_rad = data.position_rad[:, 1]
     size_nm = COSINE_NM * np.cos(LOBES * position_rad) + SINE_NM * np.sin(LOBES * position_rad)
     velocity_sign = np.sign(data.velocity_rad_s[:, 1])
-    torque_nm = size_nm * velocity_sign
+    torque_nm = (DRY_NM + size_nm) * velocity_sign
     return acting_on(1, 3, torque_nm)
 
 
