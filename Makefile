@@ -101,6 +101,7 @@ $(STAMP): requirements.lock pyproject.toml
 	@$(BIN)/python .ci/set_up.py requirements.lock
 	@$(BIN)/python -m pip install -qq --no-deps --no-build-isolation --editable .
 	@touch $@
+	@echo 'drivegain is in $(BIN). In each terminal: export PATH="$(abspath $(BIN)):$$PATH"'
 
 demo: setup
 	$(BIN)/drivegain demo --out out/demo

@@ -99,13 +99,17 @@ def init(
         typer.echo(path)
     cell = folder / "cells" / f"{folder.resolve().name}.yaml"
     if simulated:
-        say("The cell is that of the demonstration: a six-axis arm on a simulated bus.", err=True)
-    else:
         say(
-            f"Edit {cell} first: its numbers are an example's, and its comments say what "
-            "replaces them.",
+            "The cell is that of the demonstration, on the bus of `drivegain simulate demo`.",
             err=True,
         )
+        say_next("drivegain", "calibrate", cell, "--enable-motion")
+        return
+    say(
+        f"Edit {cell} first: its numbers are an example's, and its comments say what "
+        "replaces them.",
+        err=True,
+    )
     say_next("drivegain", "scan", cell)
 
 

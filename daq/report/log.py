@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from rich.text import Text
 
 from daq.config.cell_buses import bus_loads
+from daq.log.metadata import RECORDED
 from daq.log.motion import judge_log
 from daq.report.bus_views import current_signals
 from daq.report.document import Figure, Report
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
     from daq.log.bag_writer import BagWritten
     from daq.log.export import Exported, TableFormat
     from daq.log.importing import Imported
-    from daq.log.metadata import Timing
+    from daq.log.metadata import RunInfo, Timing
     from daq.log.salvage import Salvaged
     from daq.workflow.record import Recorded
 
@@ -259,7 +260,7 @@ def info_report(path: Path) -> InfoReport:
         cell=cell.name,
         cell_sha256=cell.digest,
         axes=cell.axis_names,
-        current=current_signals(cell),
+        current=_recorded_currents(run, cell),
         samples=samples,
         duration_s=samples / run.rate_hz,
         stamped_duration_s=reader.checks.span_ns * 1e-9,
@@ -277,13 +278,22 @@ def info_report(path: Path) -> InfoReport:
     )
 
 
+def _recorded_currents(run: RunInfo, cell: Cell) -> dict[str, str]:
+    """What each axis' current is: an object of its drive, or a column of an imported file."""
+    currents = current_signals(cell)
+    if run.origin.startswith(RECORDED):
+        return currents
+    # The objects that its cell file names are those of a recording.
+    return dict.fromkeys(currents, "a column of the imported file")
+
+
 def timing_text(timing: Timing) -> str:
     """Describe the time stamps of an import, for a sentence."""
     parts = [
         f"usual step {1e3 * timing.usual_step_s:.6g} ms, longest "
         f"{1e3 * timing.longest_step_s:.6g} ms",
-        f"jitter {1e3 * timing.jitter_s:.3g} ms",
-        f"drift {1e3 * timing.drift_s:.3g} ms",
+        f"jitter {1e3 * timing.jitter_s:.3f} ms",
+        f"drift {1e3 * timing.drift_s:.3f} ms",
     ]
     counts = (
         (timing.missing, "missing and interpolated"),
@@ -294,7 +304,8 @@ def timing_text(timing: Timing) -> str:
     how = "uniform at"
     if timing.resampled:
         how = "resampled to"
-    return f"{how} {timing.rate_hz:.6g} Hz: {', '.join(parts)}"
+    # Seven digits: a rate of 1 MHz would be written with an exponent otherwise.
+    return f"{how} {timing.rate_hz:.7g} Hz: {', '.join(parts)}"
 
 
 FOR_PROGRAMS = frozenset({"wall_minus_monotonic_s"})

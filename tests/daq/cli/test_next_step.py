@@ -330,21 +330,27 @@ def test_a_search_that_wrote_nothing_names_itself_only_where_nothing_is_to_be_co
     assert ("Next: drivegain residual bare.mcap" in said) == (not diagnoses)
 
 
-@pytest.mark.parametrize("simulated", [False, True])
+@pytest.mark.parametrize(
+    ("options", "says", "next_verb"),
+    [
+        ((), "Edit saw/cells/saw.yaml first", "scan"),
+        (("--simulated",), "The cell is that of the demonstration", "calibrate"),
+    ],
+)
 def test_a_new_cell_file_is_edited_first_unless_it_is_of_the_simulated_cell(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
-    simulated: bool,
+    options: tuple[str, ...],
+    says: str,
+    next_verb: str,
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    code = run_verb("init", "saw", *(["--simulated"] if simulated else []))
+    code = run_verb("init", "saw", *options)
     assert code == 0
     first, last = capsys.readouterr().err.splitlines()
-    assert first.startswith(
-        "The cell is that of the demonstration" if simulated else "Edit saw/cells/saw.yaml first"
-    )
-    assert next_step(last) == "scan"
+    assert first.startswith(says)
+    assert next_step(last) == next_verb
 
 
 @pytest.mark.slow

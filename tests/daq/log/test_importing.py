@@ -877,6 +877,8 @@ def test_jittered_stamps_are_the_sample_times(
     report = info_report(inputs.out)
     timing = json_tree(report)["timing"]
     assert timing == document["timing"]
+    # Not the object of a drive, which no recorder has read
+    assert set(report.current.values()) == {"a column of the imported file"}
     run = inputs.load()
     time_ms = 1e3 * run.time_s
     position_deg = np.degrees(run.position_rad)
