@@ -5,11 +5,12 @@ and what the disk and the drives have afterwards.
 
 One unit is one changing call of one verb: a kill (SIGKILL) before it; EIO, ENOSPC, EROFS and
 EDQUOT, once and from that call on; and for a write(2), that the system takes half of it. `apply
---drives`, `recalibrate` and `calibrate` take longer: there each call gets the kill, one of the eight
-errors in turn, and the short write. After each fault: the controller's file is the old one or the
-new one, drives have old and new gains of which a record knows, the audit log holds, the history has
-what was written, each sentence that was printed is true, the exit code is right; then the same
-command, or `history --add` where the write was done, ends with 0, and so does `history --verify`.
+--drives`, `recalibrate` and `calibrate` take longer: there each call gets the kill, each error
+either once or from that call on, and the short write. After each fault: the controller's file is
+the old one or the new one, drives have old and new gains of which a record knows, the audit log
+holds, the history has what was written, each sentence that was printed is true, the exit code is
+right; then the same command, or `history --add` where the write was done, ends with 0, and so does
+`history --verify`.
 Nothing is drawn at random: every call is taken.
 """  # noqa: E501
 

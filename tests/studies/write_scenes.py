@@ -115,17 +115,17 @@ class CallUnit:
         return (*found, *self._short)
 
     @property
-    def injections_in_turn(self) -> tuple[Injection, ...]:
-        """The kill, one of the errors in turn, and the short write:
+    def fewer_injections(self) -> tuple[Injection, ...]:
+        """The kill, each error either once or from this call on, and the short write:
         for a verb that takes long.
         """
         found = []
         if self.call != "close":
             found.append(Injection(KILL))
-        error = ERRORS[self.number % len(ERRORS)]
-        is_lasting = self.number // len(ERRORS) % 2 == 1
-        injection = Injection(errno.errorcode[error], is_lasting)
-        found.append(injection)
+        for place, error in enumerate(ERRORS):
+            is_lasting = (self.number + place) % 2 == 1
+            injection = Injection(errno.errorcode[error], is_lasting)
+            found.append(injection)
         return (*found, *self._short[:1])
 
     @property
@@ -485,7 +485,7 @@ class DrivesScene(ApplyScene):
         """A frame that cannot be sent is lost with its bus."""
         if unit.call == "send":
             return (Injection(KILL), Injection("EIO", is_lasting=unit.number % 2 == 1))
-        return unit.injections_in_turn
+        return unit.fewer_injections
 
     def gains(self) -> bytes:
         """Gains in each drive now, and after its next power-on."""
@@ -569,8 +569,8 @@ class JobScene(Scene):
         self.rig.tools = replace(self.rig.tools, save_report=save_page)
 
     def injections(self, unit: CallUnit) -> tuple[Injection, ...]:
-        """Not every error at each call: a job takes long."""
-        return unit.injections_in_turn
+        """Each error in one of its two ways: a job takes long."""
+        return unit.fewer_injections
 
     def conclude(self, journal: Journal) -> Conclusion:
         """Run the job."""
