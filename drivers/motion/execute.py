@@ -25,6 +25,7 @@ from drivers.errors import (
     DriverError,
     MotionRefused,
     MotionTimeout,
+    NodeMissing,
     StateRefused,
     node_label,
     text_of,
@@ -43,7 +44,7 @@ from drivers.profiles.cia402 import (
     decode,
     next_command,
 )
-from drivers.profiles.profile import ObjectEntry
+from drivers.profiles.profile import Axis, ObjectEntry
 from drivers.stream.cycles import LARGEST_LAG_NS, nothing_to_send
 from drivers.stream.stream import MAX_MISSING_CYCLES, SyncStream
 from drivers.stream.watch import FrozenData
@@ -405,17 +406,16 @@ class _Execution:
                 None, EventKind.STOP_UNCONFIRMED, 0, f"the bus ended the stop by PDO: {error}"
             )
             self.problems.append(error)
+        nodes = [self._nodes[axis] for axis in unconfirmed]
         try:
-            silent = self._network.find_silent([self._nodes[axis] for axis in unconfirmed])
+            silent = self._find_silent(nodes)
         except DriverError as error:
-            self.report(None, EventKind.STOP_UNCONFIRMED, 0, f"the bus ended the stop: {error}")
-            self.problems = self.problems or [error]
+            self._add_problem(error)
             return
         unheard: tuple[int, ...] = ()
         if silent is not None:
             unheard = silent.node_ids
             self.problems.append(silent)
-        nodes = [self._nodes[axis] for axis in unconfirmed]
         self._network.begin_stop([node for node in nodes if node.node_id not in unheard])
         for axis, node in zip(unconfirmed, nodes, strict=True):
             try:
@@ -427,6 +427,24 @@ class _Execution:
                 text = str(error)
                 self.problems.append(error)
             self.report(axis, EventKind.STOP_UNCONFIRMED, self._sample.statusword[axis], text)
+
+    def _find_silent(self, nodes: Sequence[Axis]) -> NodeMissing | None:
+        """Return the error for the nodes that do not answer; None where all do.
+
+        A failure of one of several buses is raised once, and then the others go on. After such a
+        failure the nodes are asked again, so that those of the other buses are stopped.
+        """
+        try:
+            return self._network.find_silent(nodes)
+        except DriverError as error:
+            self.report(None, EventKind.STOP_UNCONFIRMED, 0, f"the bus ended the stop: {error}")
+            self._add_problem(error)
+        return self._network.find_silent(nodes)
+
+    def _add_problem(self, error: DriverError) -> None:
+        """Add an error to `problems`, unless the same one is there already."""
+        if str(error) not in map(str, self.problems):
+            self.problems.append(error)
 
     def _stop_by_pdo(self) -> Generator[Sample, None, tuple[int, ...]]:
         """Stop by synchronous RPDOs; returns the axes whose statusword does not confirm the
