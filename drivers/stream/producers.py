@@ -16,6 +16,7 @@ import os
 import socket
 import struct
 from contextlib import AbstractContextManager
+from dataclasses import dataclass
 from math import ceil
 
 from drivers.canopen.bus import BusAddress
@@ -162,6 +163,14 @@ class KernelProducer(Producer, AbstractContextManager["KernelProducer"]):
         self._link.sync_producer = None
 
 
+@dataclass(frozen=True, slots=True)
+class _SyncObjects:
+    """Values of the SYNC objects of a drive."""
+
+    cob_id: int  #: 1005h
+    period_us: int  #: 1006h
+
+
 class DriveProducer(Producer, AbstractContextManager["DriveProducer"]):
     """SYNC by a drive of the cell, `axis` by its index:
     objects 1005h (bit 30) and 1006h, which are restored.
@@ -171,7 +180,7 @@ class DriveProducer(Producer, AbstractContextManager["DriveProducer"]):
         super().__init__(network.axes[axis].name, period_us)
         self._network = network
         self._node_id = network.node_ids[axis]
-        self._before: tuple[int, int] | None = None
+        self._before: _SyncObjects | None = None  # None unless started
         self._produces = False
 
     def __exit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
@@ -190,9 +199,11 @@ class DriveProducer(Producer, AbstractContextManager["DriveProducer"]):
             return
         access = self._network.link.objects(self._node_id)
         if self._before is None:
-            self._before = (access.read(SYNC_COB_ID_OBJECT), access.read(CYCLE_PERIOD))
+            cob_id = access.read(SYNC_COB_ID_OBJECT)
+            period_us = access.read(CYCLE_PERIOD)
+            self._before = _SyncObjects(cob_id, period_us)
         self._network.link.sync_producer = self.name
-        # CiA 301: the period may be refused while the drive produces, so production begins last and
+        # Drives may refuse another period while they produce SYNC, so production begins last and
         # ends first.
         access.write(SYNC_COB_ID_OBJECT, SYNC_COB_ID)
         access.write(CYCLE_PERIOD, self.period_us)
@@ -202,9 +213,8 @@ class DriveProducer(Producer, AbstractContextManager["DriveProducer"]):
     def pause(self) -> None:
         """Tell the drive to stop, without waiting for its answer; `stop` restores its objects."""
         if self._before is not None:
-            self._network.link.send(
-                (download_request(self._node_id, SYNC_COB_ID_OBJECT, SYNC_COB_ID),)
-            )
+            request = download_request(self._node_id, SYNC_COB_ID_OBJECT, SYNC_COB_ID)
+            self._network.link.send((request,))
             self._produces = False
 
     def stop(self) -> None:
@@ -215,10 +225,12 @@ class DriveProducer(Producer, AbstractContextManager["DriveProducer"]):
         try:
             if before is not None and self._node_id not in self._network.link.silent:
                 access = self._network.link.objects(self._node_id)
-                access.write(SYNC_COB_ID_OBJECT, before[0] & ~PRODUCES)
-                access.write(CYCLE_PERIOD, before[1])
-                if before[0] & PRODUCES:
-                    access.write(SYNC_COB_ID_OBJECT, before[0])
+                # CiA 301, 1005h: bits 0 to 29 must not change while bit 30 is set. So production
+                # ends first, and another identifier comes back in a write of its own.
+                access.write(SYNC_COB_ID_OBJECT, SYNC_COB_ID)
+                access.write(CYCLE_PERIOD, before.period_us)
+                if before.cob_id != SYNC_COB_ID:
+                    access.write(SYNC_COB_ID_OBJECT, before.cob_id)
         finally:
             self._network.link.sync_producer = None
 
