@@ -123,6 +123,9 @@ class SyncStream:
                 self._open_cycle()
                 self._collect()
         except (BusError, NodeMisplaced) as error:
+            if self.bus.cycles > 0:
+                # No later cycle may report what was lost before the failure.
+                self._note_losses()
             self.bus.report(None, EventKind.BUS_LOST, 0, str(error))
             raise
         return self._finish_cycle()
@@ -214,8 +217,12 @@ class SyncStream:
         """
         is_first_call = not self._has_read_late
         self._has_read_late = True
-        with bus_errors(self._link.address):
-            self._read_late(seconds, lag_s, count_answers=is_first_call)
+        try:
+            with bus_errors(self._link.address):
+                self._read_late(seconds, lag_s, count_answers=is_first_call)
+        except (BusError, NodeMisplaced):
+            self._note_losses()
+            raise
         self._note_losses()
         self._watch.note_events()
 
