@@ -252,6 +252,7 @@ class SynchronousSdoClient(SdoClient):
         deadline_ns = self._bus.clock() + round(self._policy.transfer_s * 1e9)
         most = self._policy.most_bytes
         data = bytearray()
+        open_stream: type[BlockUploadStream | ReadableStream]
         open_stream = BlockUploadStream if block else ReadableStream
         try:
             with open_stream(self, index, subindex) as stream:
