@@ -18,9 +18,21 @@ from drivers.profiles.profile import Amplitude, DriveProfile
 SMALLEST_RATED_A = 0.01
 LARGEST_RATED_A = 1000.0
 """Range of servo motors; a value outside was entered in another unit than mA."""
-#: Least number of raw units in the rated current; with fewer, rounding alone is 5 % of it
+#: Least number of raw units in the rated current; with fewer, one unit is more than 5 % of it
 MIN_STEPS = 20.0
-FINE = 1.25  #: Ratio that tolerances of Kt and a gear's efficiency explain
+#: Ratio of two torque constants that tolerances of Kt and a gear's efficiency explain
+LARGEST_KT_RATIO = 1.25
+#: Ratio to √2 or 1/√2 that is still taken for peak and RMS ampere
+_LARGEST_AMPLITUDE_RATIO = 1.08
+
+
+@dataclass(frozen=True, slots=True)
+class _RatedValues:
+    """Rated values of the motor, as the drive reports them."""
+
+    current_a: float | None  #: None where the drive reports none
+    torque_nm: float | None  #: None where the drive reports none
+    warnings: tuple[str, ...]  #: what cannot be checked without them
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +68,7 @@ def read_scale(access: ObjectAccess, profile: DriveProfile) -> ScaleReading:
         )
 
     scale = profile.current_scale
-    entry = profile.current
+    current = profile.current
     values = {str(entry): access.read(entry) for entry in scale.objects}
     for name, value in values.items():
         if value <= 0:
@@ -65,35 +77,51 @@ def read_scale(access: ObjectAccess, profile: DriveProfile) -> ScaleReading:
                 "motor's rated current and torque in the drive"
             )
             raise implausible(f"{name} = {value}", "the motor's rated value", remedy)
-    choice = 0 if scale.switch is None else access.read(scale.switch)
+    if scale.switch is None:
+        switch_value = 0
+    else:
+        switch_value = access.read(scale.switch)
     try:
-        ampere = scale.ampere_per_unit(tuple(values.values()), choice)
+        ampere_per_unit = scale.ampere_per_unit(tuple(values.values()), switch_value)
     except IndexError as error:
         remedy = (
             "this firmware scales its current in a way that is not in the profile; complete "
             "the profile"
         )
-        raise implausible(
-            f"{scale.switch} = {choice}", f"0 to {len(scale.weights) - 1}", remedy
-        ) from error
+        expected = f"0 to {len(scale.weights) - 1}"
+        raise implausible(f"{scale.switch} = {switch_value}", expected, remedy) from error
     if scale.switch is not None:
-        values[str(scale.switch)] = choice
-    rated_a, rated_nm, warnings = _read_rated(access, profile)
+        values[str(scale.switch)] = switch_value
+    rated = _read_rated(access, profile)
+    rated_a = rated.current_a
     if rated_a is not None:
         if not SMALLEST_RATED_A <= rated_a <= LARGEST_RATED_A:
             expected = f"{SMALLEST_RATED_A:g} to {LARGEST_RATED_A:g} A"
             remedy = "was it entered in another unit than the drive's manual says?"
             raise implausible(f"a rated current of {rated_a:g} A", expected, remedy)
-        steps = rated_a / ampere
-        most = 2 ** (entry.bits - 1 if entry.signed else entry.bits) - 1
-        if not MIN_STEPS <= steps <= most:
-            raise implausible(
-                f"a rated current of {rated_a:g} A in steps of {ampere:.4g} A, {steps:.3g} of them",
-                f"{MIN_STEPS:g} to {most} steps, the range of {entry}",
-                "the scale is not this drive's, or the rated current is not its motor's: check "
-                "profile and set-up",
+        steps = rated_a / ampere_per_unit
+        magnitude_bits = current.bits
+        if current.signed:
+            magnitude_bits -= 1
+        largest_raw = 2**magnitude_bits - 1
+        if not MIN_STEPS <= steps <= largest_raw:
+            found = (
+                f"a rated current of {rated_a:g} A in steps of {ampere_per_unit:.4g} A, "
+                f"{steps:.3g} of them"
             )
-    return ScaleReading(ampere, values, rated_a, rated_nm, warnings)
+            expected = f"{MIN_STEPS:g} to {largest_raw} steps, the range of {current}"
+            remedy = (
+                "the scale is not this drive's, or the rated current is not its motor's: check "
+                "profile and set-up"
+            )
+            raise implausible(found, expected, remedy)
+    return ScaleReading(
+        ampere_per_unit=ampere_per_unit,
+        objects=values,
+        rated_current_a=rated_a,
+        rated_torque_nm=rated.torque_nm,
+        warnings=rated.warnings,
+    )
 
 
 def check_nameplate(
@@ -115,16 +143,16 @@ def check_nameplate(
     if reported is None:
         return ()
     ratio = reported / declared
+    if 1.0 / LARGEST_KT_RATIO < ratio < LARGEST_KT_RATIO:
+        return ()
     evidence = (
         f"{reported:.4g} Nm/A by the drive ({reading.rated_torque_nm:g} Nm / "
         f"{reading.rated_current_a:g} A), {declared:.4g} Nm/A by the nameplate in the cell file, "
         f"{ratio:.3g} times"
     )
-    if 1.0 / FINE < ratio < FINE:
-        return ()
-    if any(
-        abs(math.log(ratio * root)) < math.log(1.08) for root in (math.sqrt(2.0), math.sqrt(0.5))
-    ):
+    # Peak and RMS differ by √2 or by 1/√2.
+    log_distance = abs(abs(math.log(ratio)) - math.log(math.sqrt(2.0)))
+    if log_distance < math.log(_LARGEST_AMPLITUDE_RATIO):
         hint = (
             "near √2: one of them counts peak and the other RMS ampere (this profile: "
             f"{amplitude.value})"
@@ -134,42 +162,34 @@ def check_nameplate(
     return (f"torque constants differ: {evidence}; {hint}",)
 
 
-def _read_rated(
-    access: ObjectAccess, profile: DriveProfile
-) -> tuple[float | None, float | None, tuple[str, ...]]:
-    """Read rated current [A] and torque [Nm] of the motor, None where the drive reports none,
-    and warnings.
-    """
-    if profile.rated is None:
-        return (
-            None,
-            None,
-            (f"profile {profile.name} has no rated current; the ampere cannot be checked",),
-        )
+def _read_rated(access: ObjectAccess, profile: DriveProfile) -> _RatedValues:
+    """Read rated current and torque of the motor."""
     rated = profile.rated
-    current = access.read_optional(rated.current)
-    # The drive's torque is in thousandths of its rated torque.
-    if profile.torque is None:
-        unlogged = ""
-    else:
-        unlogged = f", and its torque ({profile.torque}) is not logged"
-    if not current:  # 0 is "not entered"
-        found = (
+    if rated is None:
+        warning = f"profile {profile.name} has no rated current; the ampere cannot be checked"
+        return _RatedValues(None, None, (warning,))
+    # A drive gives its torque in thousandths of the rated torque: without that it has no unit.
+    not_logged = ""
+    if profile.torque is not None:
+        not_logged = f", and its torque ({profile.torque}) is not logged"
+    current_raw = access.read_optional(rated.current)
+    if not current_raw:  # 0 is "not entered"
+        warning = (
             f"drive reports no rated current ({rated.current}); the ampere cannot be "
-            f"checked{unlogged}"
+            f"checked{not_logged}"
         )
-        return None, None, (found,)
+        return _RatedValues(None, None, (warning,))
+    current_a = current_raw * rated.ampere_per_unit
     if rated.torque is None:
-        torque = None
+        torque_raw = None
+        missing = "no rated torque"
     else:
-        torque = access.read_optional(rated.torque)
-    if not torque:
-        if rated.torque is None:
-            missing = "no rated torque"
-        else:
-            missing = f"drive reports no rated torque ({rated.torque})"
-        found = (
-            f"{missing}; the torque constant cannot be checked (no gain depends on this){unlogged}"
+        torque_raw = access.read_optional(rated.torque)
+        missing = f"drive reports no rated torque ({rated.torque})"
+    if not torque_raw:
+        warning = (
+            f"{missing}; the torque constant cannot be checked (no gain depends on this)"
+            f"{not_logged}"
         )
-        return current * rated.ampere_per_unit, None, (found,)
-    return current * rated.ampere_per_unit, torque * rated.newton_metre_per_unit, ()
+        return _RatedValues(current_a, None, (warning,))
+    return _RatedValues(current_a, torque_raw * rated.newton_metre_per_unit, ())

@@ -17,10 +17,13 @@ from drivers.errors import ObjectAccessError
 from drivers.profiles.profile import ObjectEntry
 
 NO_SUCH_OBJECT = frozenset((0x0602_0000, 0x0609_0011))
-"""Aborts of a drive that lacks the object or its sub-index (CiA 301);
-any other may be gone at the next request.
+"""Aborts of a drive that lacks the object or its sub-index (CiA 301).
+
+Any other abort may have a cause that passes: the next request may be answered with a value.
 """
-SDO_REQUEST, SDO_ANSWER = 0x600, 0x580  #: COB-IDs, to which the node id is added (CiA 301)
+# COB-IDs, to which the node id is added (CiA 301)
+SDO_REQUEST = 0x600
+SDO_ANSWER = 0x580
 _ABORT_TIMED_OUT = 0x0504_0000
 _ABORT_UNKNOWN_COMMAND = 0x0504_0001
 _ABORT_OUT_OF_MEMORY = 0x0504_0005
@@ -28,13 +31,19 @@ _ABORT = 0x80
 _SEGMENT_BYTES = 7
 #: Answers to other requests that are skipped, before a node counts as one that does not answer
 MOST_SURPLUS = 64
+# Command specifiers: bits 5 to 7 of the first byte (CiA 301)
 _INITIATE_DOWNLOAD = 1
 _INITIATE_UPLOAD = 2
 _INITIATE_BLOCK_UPLOAD = 5
+#: Requests with the index and sub-index of their object
+_NAMING_REQUESTS = frozenset((_INITIATE_DOWNLOAD, _INITIATE_UPLOAD, _INITIATE_BLOCK_UPLOAD))
 _UPLOAD_REQUEST = _INITIATE_UPLOAD << 5
-#: Bits of an upload answer with its data, and of one that says their size
-_EXPEDITED, _SIZE_INDICATED = 0x42, 0x01
-_HEAD = struct.Struct("<BHB")
+# Bits of the first byte of an expedited transfer: its data are in the frame itself
+_EXPEDITED = 0x02
+_SIZE_INDICATED = 0x01
+_EXPEDITED_ANSWER = _INITIATE_UPLOAD << 5 | _EXPEDITED  #: To an upload request
+_EXPEDITED_ANSWER_MASK = 0xE0 | _EXPEDITED
+_HEAD = struct.Struct("<BHB")  #: First byte, index and sub-index
 
 T = TypeVar("T")
 
@@ -57,9 +66,9 @@ def upload_request(node_id: int, entry: ObjectEntry) -> can.Message:
 
 
 def download_request(node_id: int, entry: ObjectEntry, value: int) -> can.Message:
-    """Return the request to write an object of at most four bytes."""
-    # Expedited, with its size
-    command = _INITIATE_DOWNLOAD << 5 | (4 - entry.bits // 8) << 2 | 0x03
+    """Return the request to write an unsigned object of at most four bytes."""
+    unused_bytes = 4 - entry.bits // 8
+    command = _INITIATE_DOWNLOAD << 5 | unused_bytes << 2 | _EXPEDITED | _SIZE_INDICATED
     data = _HEAD.pack(command, entry.index, entry.subindex) + struct.pack("<L", value)
     return base_frame(SDO_REQUEST + node_id, data)
 
@@ -70,18 +79,24 @@ def upload_answer(data: bytes, entry: ObjectEntry) -> UploadAnswer | None:
 
     Data longer than the object are cut: some drives send four bytes whatever its size is.
     """
-    if len(data) != 8 or _HEAD.unpack_from(data)[1:] != (entry.index, entry.subindex):
+    if len(data) != 8:
         return None
-    command = data[0]
+    command, index, subindex = _HEAD.unpack_from(data)
+    if (index, subindex) != (entry.index, entry.subindex):
+        return None
     if command == _ABORT:
         return UploadAnswer(abort_code=int.from_bytes(data[4:], "little"))
-    if command & 0xE2 != _EXPEDITED:
-        return UploadAnswer()
-    size = 4 - (command >> 2 & 3) if command & _SIZE_INDICATED else 4
-    if 8 * size < entry.bits:
-        return UploadAnswer(bits=8 * size)
+    if command & _EXPEDITED_ANSWER_MASK != _EXPEDITED_ANSWER:
+        return UploadAnswer()  # without data
+    size_bytes = 4
+    if command & _SIZE_INDICATED:
+        unused_bytes = command >> 2 & 3
+        size_bytes = 4 - unused_bytes
+    bits = 8 * size_bytes
+    if bits < entry.bits:
+        return UploadAnswer(bits=bits)
     value = int.from_bytes(data[4 : 4 + entry.bits // 8], "little", signed=entry.signed)
-    return UploadAnswer(value, bits=8 * size)
+    return UploadAnswer(value, bits)
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +104,7 @@ class SdoPolicy:
     """Limits of a transfer; answers do get lost near SYNC traffic."""
 
     timeout_s: float = 0.5  #: until an answer
-    attempts: int = 3  #: where no answer comes
+    attempts: int = 3  #: requests for one object, where no answer comes
     transfer_s: float = 2.0  #: until the end of an object of several frames
     most_bytes: int = 4096  #: of one object
 
@@ -116,21 +131,28 @@ class ObjectAccess:
             ObjectAccessError: aborted, not answered, or shorter than the entry.
         """
         data = self.read_bytes(entry.index, entry.subindex)
-        if 8 * len(data) < entry.bits:
-            raise ObjectAccessError(
-                self, str(entry), f"has {8 * len(data)} bits, expected {entry.bits}"
-            )
+        bits = 8 * len(data)
+        if bits < entry.bits:
+            raise ObjectAccessError(self, str(entry), f"has {bits} bits, expected {entry.bits}")
         # Some drives send four bytes whatever the object's size is.
         return int.from_bytes(data[: entry.bits // 8], "little", signed=entry.signed)
 
     def read_optional(self, entry: ObjectEntry, *, any_abort: bool = False) -> int | None:
-        """Read an integer object that a drive need not have;
-        None where it has none, or aborts for any reason.
+        """Read an integer object that a drive need not have; None where it has none.
+
+        Args:
+            entry: the object.
+            any_abort: return None after every other abort as well.
+
+        Raises:
+            ObjectAccessError: another abort, no answer, or shorter than the entry.
         """
         try:
             return self.read(entry)
         except ObjectAccessError as error:
-            if error.abort_code in NO_SUCH_OBJECT or (any_abort and error.abort_code is not None):
+            if error.abort_code in NO_SUCH_OBJECT:
+                return None
+            if any_abort and error.abort_code is not None:
                 return None
             raise
 
@@ -143,9 +165,8 @@ class ObjectAccess:
         try:
             data = value.to_bytes(entry.bits // 8, "little", signed=entry.signed)
         except OverflowError as error:
-            raise ObjectAccessError(
-                self, str(entry), f"{value} does not fit {entry.bits} bits"
-            ) from error
+            reason = f"{value} does not fit {entry.bits} bits"
+            raise ObjectAccessError(self, str(entry), reason) from error
         self._attempt(str(entry), lambda: self._client.download(entry.index, entry.subindex, data))
 
     def read_bytes(self, index: int, subindex: int) -> bytes:
@@ -154,11 +175,13 @@ class ObjectAccess:
         return self._attempt(name, lambda: self._client.upload(index, subindex))
 
     def _attempt(self, name: str, transfer: Callable[[], T]) -> T:
+        """Return the result of a transfer, which is tried again where no answer comes."""
         reason = ""
         for _ in range(self._policy.attempts):
             if self._client.closing_is_over:
-                reason = reason or "the time for closing the network was over"
-                break
+                if not reason:
+                    reason = "the time for closing the network was over"
+                raise ObjectAccessError(self, name, reason)
             try:
                 return transfer()
             except SdoAbortedError as error:
@@ -168,16 +191,14 @@ class ObjectAccess:
                 raise ObjectAccessError(self, name, str(error)) from error
             except SdoCommunicationError as error:
                 reason = str(error)
-        else:
-            reason = f"{reason}, asked {self._policy.attempts} times"
-        raise ObjectAccessError(self, name, reason)
+        raise ObjectAccessError(self, name, f"{reason}, asked {self._policy.attempts} times")
 
 
 class _Bus(Protocol):
     """The reader of the bus (drivers/canopen/link.py)."""
 
     clock: Clock
-    asked_by: dict[int, object]
+    asked_by: dict[int, object]  #: sender of the last request to each node, by node id
 
     def send(self, messages: Sequence[can.Message]) -> None: ...
 
@@ -188,11 +209,11 @@ class _Bus(Protocol):
     def note_twice(self, node_id: int, first: bytes, second: bytes) -> None: ...
 
 
-def _unaborted(response: bytes) -> bytes:
-    """Return an answer, or raise the abort that it is."""
+def _raise_if_aborted(response: bytes) -> None:
+    """Raise SdoAbortedError where an answer is an abort."""
     if response[0] == _ABORT:
-        raise SdoAbortedError(struct.unpack_from("<L", response, 4)[0])
-    return response
+        (abort_code,) = struct.unpack_from("<L", response, 4)
+        raise SdoAbortedError(abort_code)
 
 
 class SynchronousSdoClient(SdoClient):
@@ -206,8 +227,9 @@ class SynchronousSdoClient(SdoClient):
         SdoClient.__init__(self, SDO_REQUEST + node_id, SDO_ANSWER + node_id, ObjectDictionary())
         self._bus = bus
         self._policy = policy
-        self._answered = b""  # the last answer, if only one can have been sent for it
-        # Objects whose request was given up: its answer may still come
+        # Answer to the last request; empty where a second answer is no sign of a second device.
+        self._answered = b""
+        # Objects whose request was given up, by index and sub-index: its answer may still come.
         self._unanswered: set[bytes] = set()
 
     def upload(self, index: int, subindex: int) -> bytes:
@@ -226,25 +248,25 @@ class SynchronousSdoClient(SdoClient):
         return self._read_whole(index, subindex, block=True)
 
     def _read_whole(self, index: int, subindex: int, *, block: bool) -> bytes:
-        deadline = self._bus.clock() + round(self._policy.transfer_s * 1e9)
+        """Read all segments of an object; see `upload`."""
+        deadline_ns = self._bus.clock() + round(self._policy.transfer_s * 1e9)
         most = self._policy.most_bytes
         data = bytearray()
+        open_stream: type[BlockUploadStream | ReadableStream]
+        open_stream = BlockUploadStream if block else ReadableStream
         try:
-            with (
-                BlockUploadStream(self, index, subindex)
-                if block
-                else ReadableStream(self, index, subindex) as stream
-            ):
-                size = stream.size or 0
+            with open_stream(self, index, subindex) as stream:
                 read = cast("Callable[[int], bytes]", stream.read)
-                while size <= most and (segment := read(_SEGMENT_BYTES)):
+                # The size that the node announces, or more where it sends more
+                size = stream.size or 0
+                while size <= most:
+                    segment = read(_SEGMENT_BYTES)
+                    if not segment:
+                        return bytes(data)
                     data += segment
                     size = max(size, len(data))
-                    if self._bus.clock() >= deadline:
+                    if self._bus.clock() >= deadline_ns:
                         break
-                else:
-                    if size <= most:
-                        return bytes(data)
         except AttributeError as error:  # canopen's block transfer, where its end does not come
             raise SdoCommunicationError("the block transfer was not ended") from error
         self.abort(_ABORT_OUT_OF_MEMORY)
@@ -275,14 +297,18 @@ class SynchronousSdoClient(SdoClient):
 
     def read_response(self) -> bytes:
         """Wait for the next answer of the node; SdoCommunicationError where none comes in time."""
-        return _unaborted(self._read_until(self._deadline()))
+        response = self._read_until(self._deadline())
+        _raise_if_aborted(response)
+        return response
 
     def _deadline(self) -> int:
+        """Return the time by the clock until which an answer is waited for [ns]."""
         return self._bus.clock() + round(self._bus.allowed_s(self._policy.timeout_s) * 1e9)
 
-    def _read_until(self, deadline: int) -> bytes:
+    def _read_until(self, deadline_ns: int) -> bytes:
+        """Return the next answer; SdoCommunicationError where none comes by then."""
         while self.responses.empty():
-            left_s = (deadline - self._bus.clock()) * 1e-9
+            left_s = (deadline_ns - self._bus.clock()) * 1e-9
             if left_s <= 0:
                 raise SdoCommunicationError(f"no answer within {self._policy.timeout_s:g} s")
             self._bus.pump(left_s)
@@ -295,42 +321,39 @@ class SynchronousSdoClient(SdoClient):
         """
         self._bus.pump(0.0)
         self.responses.queue.clear()
-        before = self._answered
+        last_answer = self._answered
         self._answered = b""
         if self._bus.asked_by.get(self.tx_cobid - SDO_ANSWER) is not self:
-            before = b""
+            last_answer = b""
         self.send_request(sdo_request)
         requested = bytes(sdo_request[1:4])
-        names_object = sdo_request[0] >> 5 in (
-            _INITIATE_DOWNLOAD,
-            _INITIATE_UPLOAD,
-            _INITIATE_BLOCK_UPLOAD,
-        )
-        deadline = self._deadline()
+        names_object = sdo_request[0] >> 5 in _NAMING_REQUESTS
+        deadline_ns = self._deadline()
         for _ in range(MOST_SURPLUS):
             try:
-                response = self._read_until(deadline)
+                response = self._read_until(deadline_ns)
             except SdoCommunicationError:
                 self._give_up(requested)
                 raise
-            about = response[1:4]
-            if (
-                names_object
-                and about != requested
-                and not (response[0] == _ABORT and about == b"\0\0\0")
-            ):
-                self._note_surplus(before, response)  # or a late answer to an earlier request
+            answered_object = response[1:4]
+            # Some nodes abort without the index of the object.
+            is_unnamed_abort = response[0] == _ABORT and answered_object == b"\0\0\0"
+            if names_object and answered_object != requested and not is_unnamed_abort:
+                # A second answer to the last request, or a late answer to an earlier one
+                self._note_surplus(last_answer, response)
                 continue
             if names_object and requested not in self._unanswered:
                 self._answered = response
             else:
                 self._answered = b""
             self._unanswered.discard(requested)
-            return _unaborted(response)
+            _raise_if_aborted(response)
+            return response
         self._give_up(requested)
         raise SdoCommunicationError(f"{MOST_SURPLUS} answers to other requests")
 
     def _give_up(self, requested: bytes) -> None:
+        """Abort a request that was not answered."""
         self._unanswered.add(requested)
         self.abort()
 

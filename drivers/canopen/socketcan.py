@@ -32,8 +32,9 @@ RECEIVE_BUFFER_BYTES = 4 << 20
 #: Time for the capture process to start; a loaded machine is slow to start an interpreter
 START_S = 20.0
 END_S = 1.0  #: Time for the capture process to end by itself
-SEND_S = 0.1  #: Longest time of a full transmit queue: at 10 kbit/s a frame takes 13 ms
-SEND_RETRY_S = 0.0002
+#: Longest time to wait while the transmit queue is full: at 10 kbit/s a frame takes 13 ms
+SEND_S = 0.1
+SEND_RETRY_S = 0.0002  #: Time between two attempts meanwhile
 # asm-generic/socket.h
 SO_RCVBUFFORCE = 33  #: Exceeds net.core.rmem_max; needs CAP_NET_ADMIN
 SO_TIMESTAMPNS = 35
@@ -42,7 +43,8 @@ CAN_RAW_ERR_FILTER = 2  # linux/can/raw.h; Python's socket has no name for it
 CAN_ERR_CRTL = 0x004  #: Controller problems: error passive, overflow
 CAN_ERR_BUSOFF = 0x040
 CAN_ERR_RESTARTED = 0x100
-#: Without single bus errors: a bus without a second node sends thousands a second.
+#: Error frames to receive. Errors of single frames are not among them: on a bus without a second
+#: node they come by the thousand a second.
 ERROR_CLASSES = CAN_ERR_CRTL | CAN_ERR_BUSOFF | CAN_ERR_RESTARTED
 # linux/can.h: flags in the identifier of struct can_frame, and masks of the identifier itself
 _EXTENDED = 0x8000_0000
@@ -50,7 +52,7 @@ _REMOTE = 0x4000_0000
 _ERROR = 0x2000_0000
 _BASE_MASK = 0x7FF
 _EXTENDED_MASK = 0x1FFF_FFFF
-_RECORD_BUFFER_BYTES = 1 << 18
+_RECORD_BUFFER_BYTES = 1 << 18  #: Of the socket pair to the capture process
 _FILTER = struct.Struct("=II")  #: struct can_filter
 
 
@@ -96,8 +98,9 @@ def losses_of(bus: can.BusABC) -> Losses:
 
 def receive_only(bus: can.BusABC, wanted: Sequence[tuple[int, int]]) -> None:
     """Let the kernel discard unwanted frames, where a bus can: see `SocketcanBus.receive_only`."""
-    set_filters: Callable[[Sequence[tuple[int, int]]], None] | None
-    set_filters = getattr(bus, "receive_only", None)
+    set_filters: Callable[[Sequence[tuple[int, int]]], None] | None = getattr(
+        bus, "receive_only", None
+    )
     if set_filters is not None:
         set_filters(wanted)
 
@@ -172,7 +175,7 @@ class BurstBus(can.BusABC):
     All but the first of them are returned without python-can's clock and logging.
     """
 
-    _received: deque[can.Message]
+    _received: deque[can.Message]  # frames not returned yet; subclasses begin with an empty one
 
     def take(self) -> can.Message | None:
         """Return a frame that is received already; None where the bus must be read for the next."""
@@ -283,10 +286,11 @@ class SocketcanBus(BurstBus):
                 # The interface's queue holds ten frames by default; a burst of set-points is
                 # longer.
                 if time.monotonic() >= deadline_s:
-                    raise can.CanOperationError(
+                    reason = (
                         f"the transmit queue stays full for {timeout:g} s: does any node "
                         "acknowledge frames?"
-                    ) from error
+                    )
+                    raise can.CanOperationError(reason) from error
                 time.sleep(SEND_RETRY_S)
             else:
                 return
@@ -303,7 +307,7 @@ class SocketcanBus(BurstBus):
         for identifier, mask in wanted:
             # Flags in the mask that are not in the identifier: only a base data frame matches.
             filters += _FILTER.pack(identifier, mask | _EXTENDED | _REMOTE)
-        # A socket that is no CAN_RAW has no filters: it receives all.
+        # A socket other than CAN_RAW has no filters: it receives all.
         with suppress(OSError):
             self._can_socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, filters)
 
@@ -318,6 +322,7 @@ class SocketcanBus(BurstBus):
                 return
         except (OSError, ValueError) as error:
             raise can.CanOperationError(str(error)) from error
+        # What was received last is empty at the end of the file.
         end_of_file = not self._unparsed[-1]
         if end_of_file:
             exit_code = self._wait()
@@ -362,6 +367,7 @@ class SocketcanBus(BurstBus):
         received = self._received.copy()
         ready = self._ready
         end_reason = self._end_reason
+        # These two keep the values of the last record.
         lost: list[int] = list(self.losses)
         monotonic_ns = self.read_until_ns
         for record in RECORD.iter_unpack(memoryview(unparsed)[:complete_bytes]):
@@ -387,6 +393,7 @@ class SocketcanBus(BurstBus):
     def _message(
         self, kernel_ns: int, monotonic_ns: int, can_id: int, data: bytes, own: bool, local: bool
     ) -> CapturedMessage:
+        """Return a frame of a record; `own` if this end sent it, `local` if this machine did."""
         extended = bool(can_id & _EXTENDED)
         remote = bool(can_id & _REMOTE)
         error = bool(can_id & _ERROR)
@@ -419,6 +426,7 @@ class SocketcanBus(BurstBus):
         self._close()
 
     def _close(self) -> None:
+        """End the capture process and close both sockets."""
         self._end_reason = self._end_reason or "is closed"
         # The capture process ends when its parent's end of the pair is closed.
         self._record_socket.close()

@@ -97,13 +97,13 @@ def open_cell_bus(address: CellAddress, *, answering: bool = False) -> can.BusAB
     """
     if isinstance(address, BusAddress):
         return open_bus(address, answering=answering)
-    homes: dict[int, BusPart] = {}
+    homes: dict[int, BusPart] = {}  # bus of each node, by its id
     for part in address.parts:
         for node_id in part.node_ids:
-            if (other := homes.setdefault(node_id, part)) is not part:
-                shared = (
-                    f"{node_label(node_id, part.axis_names)} is on {other.name} and on {part.name}"
-                )
+            other = homes.setdefault(node_id, part)
+            if other is not part:
+                label = node_label(node_id, part.axis_names)
+                shared = f"{label} is on {other.name} and on {part.name}"
                 raise BusError(str(address), f"{shared}; give one of the two another node id")
     ends: list[can.BusABC] = []
     for part in address.parts:
@@ -133,50 +133,63 @@ class SplitBus(can.BusABC):
         self.channel_info = str(address)
         self._ends = tuple(ends)
         self._names = tuple(map(str, address.parts))
-        self._homes: dict[int, int] = {}
+        self._homes: dict[int, int] = {}  # index of the bus of each node, by its id
         self._axis_names: dict[int, str] = {}
         for index, part in enumerate(address.parts):
             self._homes |= dict.fromkeys(part.node_ids, index)
             self._axis_names |= part.axis_names
         self._clock = clock
+        # The next frame of each bus, taken from its end and not returned yet
         self._waiting: list[can.Message | None] = [None] * len(self._ends)
-        self._failed: set[int] = set()
-        self._misplaced: set[tuple[int, int]] = set()
-        self._last = self._run = self._turn = 0
+        self._failed: set[int] = set()  # indices of the buses
+        self._misplaced: set[tuple[int, int]] = set()  # node and bus, those raised already
+        self._last_bus = 0  # of the last frame
+        self._frames_in_a_row = 0  # of that bus
+        self._waits = 0  # at one bus, where one of them has no file descriptor
         self._handles = tuple(_fileno(end) for end in self._ends)
+        # Whether all have monotonic stamps
         self._stamped = all(read_until_ns(end) is not None for end in self._ends)
         super().__init__(channel=str(address))
 
     @property
     def alive(self) -> bool:
-        """Whether one of the buses has not failed."""
+        """Whether at least one of the buses still works."""
         return len(self._failed) < len(self._ends)
 
     @property
     def losses(self) -> Losses:
         """Losses of all buses together."""
-        return Losses(*map(sum, zip(*map(losses_of, self._ends), strict=True)))
+        kernel = 0
+        interface = 0
+        backlog = 0
+        for end in self._ends:
+            losses = losses_of(end)
+            kernel += losses.kernel
+            interface += losses.interface
+            backlog += losses.backlog
+        return Losses(kernel, interface, backlog)
 
     @property
     def read_until_ns(self) -> int | None:
         """Monotonic time up to which every frame of every bus has been received;
         None where one has no stamps.
         """
-        times = [
-            read_until_ns(end) for index, end in enumerate(self._ends) if index not in self._failed
-        ]
-        known = [time_ns for time_ns in times if time_ns is not None]
-        if known and len(known) == len(times):
-            return min(known)
-        return None
+        times_ns: list[int] = []
+        for index, end in enumerate(self._ends):
+            if index in self._failed:
+                continue
+            time_ns = read_until_ns(end)
+            if time_ns is None:
+                return None
+            times_ns.append(time_ns)
+        return min(times_ns, default=None)
 
     @property
     def remarks(self) -> tuple[str, ...]:
         """Remarks for the operator on how each bus was opened."""
-        named = zip(self._names, map(remarks_of, self._ends), strict=True)
         found = []
-        for name, remarks in named:
-            for remark in remarks:
+        for name, end in zip(self._names, self._ends, strict=True):
+            for remark in remarks_of(end):
                 found.append(f"{name}: {remark}")
         return tuple(found)
 
@@ -197,22 +210,31 @@ class SplitBus(can.BusABC):
         got their frames.
         """
         failures: list[BusError] = []
-        for route, run in groupby(messages, self.address.route):
-            together = tuple(run)
-            for burst in (together,) if len(route) == 1 else ((message,) for message in together):
-                for index in route:
-                    if index in self._failed:
-                        continue
-                    try:
-                        send_burst(self._ends[index], burst)
-                    except _FAILURES as error:
-                        failures.append(self._failure(index, error))
+        for route, group in groupby(messages, self.address.route):
+            frames = tuple(group)
+            if len(route) == 1:
+                failures += self._send_to(route, frames)
+            else:
+                for frame in frames:
+                    failures += self._send_to(route, (frame,))
         if failures:
             raise failures[0]
         self._require_one()
 
+    def _send_to(self, route: Sequence[int], frames: Sequence[can.Message]) -> list[BusError]:
+        """Send frames to the buses of these indices that still work; return the new failures."""
+        failures = []
+        for index in route:
+            if index in self._failed:
+                continue
+            try:
+                send_burst(self._ends[index], frames)
+            except _FAILURES as error:
+                failures.append(self._fail(index, error))
+        return failures
+
     def recv(self, timeout: float | None = None) -> can.Message | None:
-        """Return the oldest frame that waits on any of the buses.
+        """Return the oldest frame that waits on any of the buses; None if none comes in time.
 
         Raises:
             BusError: one of the buses has just failed, or went off; or all have failed.
@@ -221,9 +243,8 @@ class SplitBus(can.BusABC):
         """
         end_s = None if timeout is None else self._clock() + timeout
         while True:
-            for index, head in enumerate(self._waiting):
-                if head is None and index not in self._failed:
-                    self._waiting[index] = self._take(index, 0.0)
+            for index in self._buses_without_frame():
+                self._waiting[index] = self._take(index, 0.0)
             oldest = self._oldest()
             if oldest is not None:
                 message = self._waiting[oldest]
@@ -239,56 +260,66 @@ class SplitBus(can.BusABC):
             self._require_one()
             self._wait(left_s)
 
+    def _buses_without_frame(self) -> list[int]:
+        """Return the indices of the buses that still work and have no frame in `_waiting`."""
+        found = []
+        for index, waiting in enumerate(self._waiting):
+            if waiting is None and index not in self._failed:
+                found.append(index)
+        return found
+
     def _take(self, index: int, timeout_s: float) -> can.Message | None:
+        """Return the next frame of one bus; its ``channel`` names that bus."""
         try:
             message = self._ends[index].recv(timeout_s)
         except _FAILURES as error:
-            raise self._failure(index, error) from error
+            raise self._fail(index, error) from error
         if message is None:
             return None
         if message.is_error_frame and message.arbitration_id & BUS_OFF:
-            raise self._failure(index, BusError(self._names[index], BUS_OFF_REASON))
+            raise self._fail(index, BusError(self._names[index], BUS_OFF_REASON))
         message.channel = self._names[index]
         return message
 
     def _oldest(self) -> int | None:
-        """Return the bus of the oldest waiting frame;
-        None where there is none, or only our SYNC of some buses.
+        """Return the bus of the oldest waiting frame; None where no frame may be returned yet.
+
+        With stamps, our own SYNC waits until it has come back from every bus that works. Then it is
+        returned once, and those of the other buses are discarded.
         """
-        waiting = [
-            (message, index) for index, message in enumerate(self._waiting) if message is not None
-        ]
+        waiting: list[tuple[can.Message, int]] = []
+        for index, message in enumerate(self._waiting):
+            if message is not None:
+                waiting.append((message, index))
         if self._stamped:
             received = [(message, index) for message, index in waiting if message.is_rx]
-            if waiting and not received and len(waiting) == len(self._ends) - len(self._failed):
-                first = waiting[0][1]
-                self._waiting = [
-                    head if index == first else None for index, head in enumerate(self._waiting)
-                ]
+            working = len(self._ends) - len(self._failed)
+            if waiting and not received and len(waiting) == working:
+                _, first = waiting[0]
+                for _, index in waiting[1:]:
+                    self._waiting[index] = None
                 return first
             waiting = received
-        # The wall clock can be set between two frames, and a float of its seconds has steps of 200
-        # ns.
-        heads: list[tuple[float, int]] = [
-            (m.monotonic_ns, index) for m, index in waiting if isinstance(m, CapturedMessage)
-        ]
-        if len(heads) < len(waiting):
-            heads = [(message.timestamp, index) for message, index in waiting]
-        if not heads:
+        if not waiting:
             return None
-        if len(heads) > 1 and self._run >= LARGEST_RUN:
-            heads = [head for head in heads if head[1] != self._last]
-        _, index = min(heads)
-        self._run = self._run + 1 if index == self._last else 1
-        self._last = index
-        return index
+        times = _arrival_times(waiting)
+        if len(times) > 1 and self._frames_in_a_row >= LARGEST_RUN:
+            times = [(stamp, index) for stamp, index in times if index != self._last_bus]
+        _, oldest = min(times)
+        if oldest == self._last_bus:
+            self._frames_in_a_row += 1
+        else:
+            self._frames_in_a_row = 1
+        self._last_bus = oldest
+        return oldest
 
     def _belongs(self, message: can.Message, index: int) -> bool:
         """Whether a frame comes from the bus of its node;
         our own SYNC, received for its time, from the first bus.
         """
         if not message.is_rx:
-            return index == min(set(range(len(self._ends))) - self._failed, default=index)
+            working = set(range(len(self._ends))) - self._failed
+            return index == min(working, default=index)
         if (
             message.is_extended_id
             or message.is_error_frame
@@ -299,32 +330,40 @@ class SplitBus(can.BusABC):
         home = self._homes.get(node_id, index)
         if home != index and (node_id, index) not in self._misplaced:
             self._misplaced.add((node_id, index))
-            raise NodeMisplaced(
-                node_id, self._names[home], self._names[index], self._axis_names.get(node_id, "")
-            )
+            axis_name = self._axis_names.get(node_id, "")
+            raise NodeMisplaced(node_id, self._names[home], self._names[index], axis_name)
         return home == index
 
     def _wait(self, left_s: float | None) -> None:
         """Wait until a frame comes on one of the buses, or the time is over."""
-        live = [n for n, head in enumerate(self._waiting) if head is None and n not in self._failed]
-        handles = [handle for index in live if (handle := self._handles[index]) is not None]
-        if len(handles) == len(live):
+        buses = self._buses_without_frame()
+        handles: list[int] = []
+        for index in buses:
+            handle = self._handles[index]
+            if handle is not None:
+                handles.append(handle)
+        if len(handles) == len(buses):
             select.select(handles, (), (), left_s)
             return
-        self._turn += 1
-        index = live[self._turn % len(live)]
-        if left_s is None or len(live) > 1:
+        # One bus in turn, each for a moment; a single one for the time that is left.
+        self._waits += 1
+        index = buses[self._waits % len(buses)]
+        if left_s is None:
             timeout_s = ALTERNATION_S
+        elif len(buses) > 1:
+            timeout_s = min(left_s, ALTERNATION_S)
         else:
             timeout_s = left_s
-        self._waiting[index] = self._take(
-            index, timeout_s if left_s is None else min(left_s, timeout_s)
-        )
+        self._waiting[index] = self._take(index, timeout_s)
 
-    def _failure(self, index: int, error: Exception) -> BusError:
-        """Leave this bus out from now on."""
+    def _fail(self, index: int, error: Exception) -> BusError:
+        """Leave a bus out from now on, and return its failure with its name.
+
+        Its own SYNC is dropped: those of the other buses do not wait for it.
+        """
         self._failed.add(index)
-        if (head := self._waiting[index]) is not None and not head.is_rx:
+        waiting = self._waiting[index]
+        if waiting is not None and not waiting.is_rx:
             self._waiting[index] = None
         if isinstance(error, BusError):
             reason = error.reason
@@ -335,6 +374,7 @@ class SplitBus(can.BusABC):
         return failure
 
     def _require_one(self) -> None:
+        """Raise BusError where all buses have failed."""
         if not self.alive:
             raise BusError(self.channel_info, "all of them have failed")
 
@@ -348,12 +388,28 @@ class SplitBus(can.BusABC):
             try:
                 end.shutdown()
             except _FAILURES as error:
-                failures.append(self._failure(index, error))
+                failures.append(self._fail(index, error))
         if failures:
             raise failures[0]
 
 
+def _arrival_times(waiting: Sequence[tuple[can.Message, int]]) -> list[tuple[float, int]]:
+    """Return the time of each frame, with the index of its bus.
+
+    It is monotonic [ns] where all frames have such stamps: the wall clock can be set between two
+    frames, and a float of its seconds has steps of 200 ns. Else it is wall time [s].
+    """
+    stamps: list[tuple[float, int]] = []
+    for message, index in waiting:
+        if isinstance(message, CapturedMessage):
+            stamps.append((message.monotonic_ns, index))
+    if len(stamps) == len(waiting):
+        return stamps
+    return [(message.timestamp, index) for message, index in waiting]
+
+
 def _fileno(end: can.BusABC) -> int | None:
+    """Return the file descriptor to wait at; None where a bus has none."""
     try:
         handle = end.fileno()
     except (NotImplementedError, OSError):

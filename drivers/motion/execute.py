@@ -25,6 +25,7 @@ from drivers.errors import (
     DriverError,
     MotionRefused,
     MotionTimeout,
+    NodeMissing,
     StateRefused,
     node_label,
     text_of,
@@ -43,12 +44,13 @@ from drivers.profiles.cia402 import (
     decode,
     next_command,
 )
-from drivers.profiles.profile import ObjectEntry
+from drivers.profiles.profile import Axis, ObjectEntry
 from drivers.stream.cycles import LARGEST_LAG_NS, nothing_to_send
 from drivers.stream.stream import MAX_MISSING_CYCLES, SyncStream
 from drivers.stream.watch import FrozenData
 
-_URGENT_CYCLES = 10  #: In which a controlword is sent with every SYNC; then with every tenth
+#: Cycles in which a controlword is sent with every SYNC; after them with every tenth
+_URGENT_CYCLES = 10
 _NEW_SETPOINT = ControlCommand.ENABLE_OPERATION | CONTROL_NEW_SETPOINT | CONTROL_CHANGE_IMMEDIATELY
 
 
@@ -67,7 +69,7 @@ class MotionBounds:
     #: flickers by several counts at rest. 16 counts in 20 cycles of 1 ms are at most 800 counts/s,
     #: 0.3 deg/s of such a motor, which is harmless to a brake.
     standstill_cycles: int = 20
-    standstill_counts: int = 16  #: largest step between two of those cycles
+    standstill_counts: int = 16  #: largest distance from its position at their begin
     #: Largest distance from a target that bit 10 reports as reached: these counts plus
     #: `arrival_fraction` of the way. It catches a drive whose bit 10 is still that of the move
     #: before. A short way lies within it from the start, so no move ends before the duration of its
@@ -136,6 +138,33 @@ def execute(
         raise
     execution.raise_failures()
     stream.check()  # faults during the stop
+
+
+class _Standstill:
+    """Detection of axes at standstill, from samples one after the other."""
+
+    def __init__(self, bounds: MotionBounds, position_counts: Sequence[int]) -> None:
+        self._bounds = bounds
+        self._rest_counts = list(position_counts)  # by axis
+        self._cycles = [0] * len(position_counts)  # in a row near that position, by axis
+
+    def add(self, sample: Sample) -> None:
+        """Compare positions with those of rest; a missing axis is not known to stand still."""
+        for axis, position in enumerate(sample.position_counts):
+            # Not with the cycle before: creeping is no standstill.
+            distance = abs(position - self._rest_counts[axis])
+            is_near = distance <= self._bounds.standstill_counts
+            is_missing = sample.missing >> axis & 1
+            if is_near and not is_missing:
+                self._cycles[axis] += 1
+            else:
+                self._cycles[axis] = 0
+            if not is_near:
+                self._rest_counts[axis] = position
+
+    def is_reached(self, axis: int) -> bool:
+        """Return whether an axis has stood still for long enough."""
+        return self._cycles[axis] >= self._bounds.standstill_cycles
 
 
 class _Execution:
@@ -246,12 +275,16 @@ class _Execution:
             # One axis a cycle: a whole set would not fit between two SYNCs of a classic bus.
             velocity = move.velocity_counts_s[axis]
             acceleration = move.acceleration_counts_s2[axis]
-            ramps = {PROFILE_ACCELERATION: acceleration, PROFILE_DECELERATION: acceleration}
-            self._send(axis, {PROFILE_VELOCITY: velocity, **ramps})
+            profile = {
+                PROFILE_VELOCITY: velocity,
+                PROFILE_ACCELERATION: acceleration,
+                PROFILE_DECELERATION: acceleration,
+            }
+            self._send(axis, profile)
             yield self._checked()
-        held = yield from self._release(moving)
-        if held:
-            raise self._timeout(number, held, self._bounds.acknowledge_s, acknowledge=0)
+        acknowledging = yield from self._release(moving)
+        if acknowledging:
+            raise self._timeout(number, acknowledging, self._bounds.acknowledge_s, acknowledge=0)
         for axis in moving:
             self._targets[axis] = move.target_counts[axis]
             self._send_command(axis, _NEW_SETPOINT)
@@ -262,34 +295,26 @@ class _Execution:
         yield sample
         yield from self._handshake(number, moving)
         duration_s = max(move.duration_s(start))
-        end = sample.cycle + self._cycles(duration_s)
+        first_end_cycle = sample.cycle + self._cycles(duration_s)
         allowed_s = 2 * duration_s + self._bounds.settle_s
         data = FrozenData(move, start, moving, self._stream.pacing.period_ns)
         for _ in range(self._cycles(allowed_s)):
             for axis in data.frozen(self._sample):
                 # A stiff axis may be there before its profile ends
                 if not self._arrived(axis, start[axis]):
-                    position = self._sample.position_counts[axis]
-                    current = self._sample.current_raw[axis]
-                    reason = (
-                        f"move {number}: position {position} and current {current} do not "
-                        "change during the move"
-                    )
-                    remedy = "is its data frozen, its encoder or its motor cable off?"
-                    error = DriveFault(self._nodes[axis], reason, remedy=remedy)
-                    self._bus.report(axis, EventKind.FROZEN, number, str(error))
-                    raise error
-            arrived = all(self._arrived(axis, start[axis]) for axis in moving)
-            if self._sample.cycle >= end and arrived and not self._held(moving):
+                    raise self._frozen(number, axis)
+            late = self._late(moving, start)
+            acknowledging = self._acknowledging(moving)
+            if self._sample.cycle >= first_end_cycle and not late and not acknowledging:
                 break
             yield self._checked()
         else:
-            late = tuple(axis for axis in moving if not self._arrived(axis, start[axis]))
+            late = self._late(moving, start)
             if late:
                 raise self._timeout(number, late, allowed_s)
-            held = self._held(moving)
-            if held:
-                raise self._timeout(number, held, allowed_s, acknowledge=0)
+            acknowledging = self._acknowledging(moving)
+            if acknowledging:
+                raise self._timeout(number, acknowledging, allowed_s, acknowledge=0)
         self._bus.report(
             None,
             EventKind.MOVE_END,
@@ -299,24 +324,36 @@ class _Execution:
         for _ in range(move.dwell_cycles):
             yield self._checked()
 
+    def _frozen(self, number: int, axis: int) -> DriveFault:
+        """Report an axis whose data do not change during a move; return the fault."""
+        position = self._sample.position_counts[axis]
+        current = self._sample.current_raw[axis]
+        reason = (
+            f"move {number}: position {position} and current {current} do not "
+            "change during the move"
+        )
+        remedy = "is its data frozen, its encoder or its motor cable off?"
+        fault = DriveFault(self._nodes[axis], reason, remedy=remedy)
+        self._bus.report(axis, EventKind.FROZEN, number, str(fault))
+        return fault
+
     def _handshake(self, number: int, moving: Sequence[int]) -> Iterator[Sample]:
-        """Set and clear the new set-point of all axes, each with the same SYNC,
-        and wait for the acknowledgements.
+        """Wait until all axes acknowledge the new set-point, then clear it with one SYNC.
 
         A drive without a buffer holds its acknowledgement until it has arrived; the move waits for
         that at its end.
         """
         waiting = tuple(moving)
         for _ in range(self._cycles(self._bounds.acknowledge_s)):
+            if not waiting:
+                break
             for axis in waiting:
                 # Repeated every cycle until acknowledged: some drives act on the second controlword
                 # only.
                 self._send_command(axis, _NEW_SETPOINT, repeat=True)
-            if not waiting:
-                break
             yield self._checked()
-            held = self._held(moving)
-            waiting = tuple(axis for axis in moving if axis not in held)
+            acknowledging = self._acknowledging(moving)
+            waiting = tuple(axis for axis in moving if axis not in acknowledging)
         if waiting:
             raise self._timeout(number, waiting, self._bounds.acknowledge_s, acknowledge=1)
         for axis in moving:
@@ -325,56 +362,66 @@ class _Execution:
         yield from self._release(moving)
 
     def _release(self, moving: Sequence[int]) -> Generator[Sample, None, tuple[int, ...]]:
-        """Clear the new set-point until no axis holds its acknowledgement;
+        """Clear the new set-point until no axis acknowledges one;
         return those that still do in the end.
         """
-        held = self._held(moving)
+        acknowledging = self._acknowledging(moving)
         for cycle in range(self._cycles(self._bounds.acknowledge_s)):
-            if not held:
+            if not acknowledging:
                 break
-            for axis in held:
-                # Less often after a while: where it is held until the drive has arrived, the bus
+            for axis in acknowledging:
+                # Less often after a while: where a drive acknowledges until it has arrived, the bus
                 # has other work.
                 is_due = cycle < _URGENT_CYCLES or cycle % _URGENT_CYCLES == 0
                 self._send_command(axis, int(ControlCommand.ENABLE_OPERATION), repeat=is_due)
             yield self._checked()
-            held = self._held(moving)
-        return held
+            acknowledging = self._acknowledging(moving)
+        return acknowledging
 
-    def _held(self, axes: Sequence[int]) -> tuple[int, ...]:
+    def _acknowledging(self, axes: Sequence[int]) -> tuple[int, ...]:
         """Return the axes that acknowledge a set-point now."""
         return tuple(
             axis for axis in axes if self._sample.statusword[axis] & STATUS_SETPOINT_ACKNOWLEDGE
         )
 
+    def _late(self, axes: Sequence[int], start: Sequence[int]) -> tuple[int, ...]:
+        """Return the axes that have not arrived; `start` has the targets of all axes before."""
+        return tuple(axis for axis in axes if not self._arrived(axis, start[axis]))
+
     def _timeout(
         self, number: int, late: tuple[int, ...], waited_s: float, acknowledge: int | None = None
     ) -> MotionTimeout:
+        """Return the error for axes that a move waited for.
+
+        `acknowledge` is the value of bit 12 that did not come; None where the axes did not arrive.
+        """
         nodes = [self._nodes[axis] for axis in late]
-        return MotionTimeout(
-            number, late, nodes, waited_s, acknowledge, self._network.other_master()
-        )
+        other_master = self._network.other_master()
+        return MotionTimeout(number, late, nodes, waited_s, acknowledge, other_master)
 
     def _arrived(self, axis: int, start: int) -> bool:
-        """Return whether bit 10 is set near the target;
-        on a short way it may be that of the move before.
+        """Return whether an axis is near its target and its bit 10 is set.
+
+        On a short way both may be so before the axis moves: see `MotionBounds.arrival_counts`.
         """
-        tolerance = self._bounds.arrival_counts + self._bounds.arrival_fraction * abs(
-            self._targets[axis] - start
-        )
-        near = abs(self._sample.position_counts[axis] - self._targets[axis]) <= tolerance
-        return near and bool(self._sample.statusword[axis] & STATUS_TARGET_REACHED)
+        target = self._targets[axis]
+        way = abs(target - start)
+        tolerance = self._bounds.arrival_counts + self._bounds.arrival_fraction * way
+        is_near = abs(self._sample.position_counts[axis] - target) <= tolerance
+        is_reached = bool(self._sample.statusword[axis] & STATUS_TARGET_REACHED)
+        return is_near and is_reached
 
     def _checked(self) -> Sample:
         """Return the next sample, in which all axes are still enabled."""
-        sample = self._sample = next(self._stream)
+        sample = next(self._stream)
+        self._sample = sample
         for axis in self._axes:
-            if not sample.missing >> axis & 1 and self._state(axis) is not State.OPERATION_ENABLED:
-                word = sample.statusword[axis]
+            is_missing = sample.missing >> axis & 1
+            state = self._state(axis)
+            if not is_missing and state is not State.OPERATION_ENABLED:
                 self._stream.check()  # the drive's own report says more
-                raise DriveFault(
-                    self._nodes[axis], f"left OPERATION ENABLED, is {decode(word)}", word
-                )
+                word = sample.statusword[axis]
+                raise DriveFault(self._nodes[axis], f"left OPERATION ENABLED, is {state}", word)
         return sample
 
     def stop(self) -> Iterator[Sample]:
@@ -405,17 +452,16 @@ class _Execution:
                 None, EventKind.STOP_UNCONFIRMED, 0, f"the bus ended the stop by PDO: {error}"
             )
             self.problems.append(error)
+        nodes = [self._nodes[axis] for axis in unconfirmed]
         try:
-            silent = self._network.find_silent([self._nodes[axis] for axis in unconfirmed])
+            silent = self._find_silent(nodes)
         except DriverError as error:
-            self.report(None, EventKind.STOP_UNCONFIRMED, 0, f"the bus ended the stop: {error}")
-            self.problems = self.problems or [error]
+            self._add_problem(error)
             return
         unheard: tuple[int, ...] = ()
         if silent is not None:
             unheard = silent.node_ids
             self.problems.append(silent)
-        nodes = [self._nodes[axis] for axis in unconfirmed]
         self._network.begin_stop([node for node in nodes if node.node_id not in unheard])
         for axis, node in zip(unconfirmed, nodes, strict=True):
             try:
@@ -428,49 +474,61 @@ class _Execution:
                 self.problems.append(error)
             self.report(axis, EventKind.STOP_UNCONFIRMED, self._sample.statusword[axis], text)
 
+    def _find_silent(self, nodes: Sequence[Axis]) -> NodeMissing | None:
+        """Return the error for the nodes that do not answer; None where all do.
+
+        A failure of one of several buses is raised once, and then the others go on. After such a
+        failure the nodes are asked again, so that those of the other buses are stopped.
+        """
+        try:
+            return self._network.find_silent(nodes)
+        except DriverError as error:
+            self.report(None, EventKind.STOP_UNCONFIRMED, 0, f"the bus ended the stop: {error}")
+            self._add_problem(error)
+        return self._network.find_silent(nodes)
+
+    def _add_problem(self, error: DriverError) -> None:
+        """Add an error to `problems`, unless the same one is there already."""
+        if str(error) not in map(str, self.problems):
+            self.problems.append(error)
+
     def _stop_by_pdo(self) -> Generator[Sample, None, tuple[int, ...]]:
         """Stop by synchronous RPDOs; returns the axes whose statusword does not confirm the
         stop.
         """
-        still = [0] * len(self._sent)
-        rest = list(self._sample.position_counts)
-        silent = 0
+        standstill = _Standstill(self._bounds, self._sample.position_counts)
+        missing_cycles = 0  # in a row, with an axis without an answer
         powered = list(self._axes)
         for cycle in range(self._cycles(self._bounds.stop_s)):
             for axis in powered:
                 state = self._state(axis)
-                resting = (
-                    state is State.QUICK_STOP_ACTIVE
-                    and still[axis] >= self._bounds.standstill_cycles
-                )
-                if resting:
+                if state is State.QUICK_STOP_ACTIVE and standstill.is_reached(axis):
                     goal = Goal.SWITCH_ON_DISABLED
                 else:
                     goal = Goal.QUICK_STOP
                 self._send_command(axis, next_command(state, goal), repeat=cycle % 10 == 0)
             self._sample = self._stream.advance()
             yield self._sample
-            for axis, position in enumerate(self._sample.position_counts):
-                # Compared with the position of rest, not with the cycle before: creeping is no
-                # standstill.
-                near = abs(position - rest[axis]) <= self._bounds.standstill_counts
-                known = not self._sample.missing >> axis & 1
-                still[axis] = still[axis] + 1 if near and known else 0
-                rest[axis] = rest[axis] if near else position
+            standstill.add(self._sample)
             missing = self._sample.missing
-            silent = silent + 1 if missing else 0
+            if missing:
+                missing_cycles += 1
+            else:
+                missing_cycles = 0
             powered = [
                 axis
                 for axis in self._axes
                 if missing >> axis & 1 or self._state(axis) not in POWERLESS
             ]
-            self._network.powered -= {
-                self._nodes[axis].node_id for axis in self._axes if axis not in powered
-            }
-            # A stream that waits for answers has waited long enough in one cycle.
-            waited = self._bus.silent and self._stream.pacing.waits_for_answers
-            tolerated = 0 if waited else MAX_MISSING_CYCLES
-            if not powered or silent > tolerated:
+            for axis in self._axes:
+                if axis not in powered:
+                    self._network.powered.discard(self._nodes[axis].node_id)
+            if self._bus.silent and self._stream.pacing.waits_for_answers:
+                # Such a stream has waited long enough in one cycle.
+                tolerated_cycles = 0
+            else:
+                tolerated_cycles = MAX_MISSING_CYCLES
+            if not powered or missing_cycles > tolerated_cycles:
                 break
         return tuple(powered)
 

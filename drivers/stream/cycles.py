@@ -77,7 +77,7 @@ class CycleBus:
         self.skipped = 0
         #: Time of the last SYNC in the samples [ns since 1970]; the start before the first one
         self.time_ns = start_ns
-        #: Time of the last answer by the clock [ns], or of the first SYNC
+        #: Time of the last answer by the clock [ns]; of the first SYNC before the first answer
         self.answered_ns = 0
         #: Whether no axis answered the last SYNC
         self.silent = False
@@ -94,7 +94,7 @@ class CycleBus:
         self._reported_late = False
 
     def begin(self) -> None:
-        """Find out whether the open bus reads in bursts (`BurstBus.take`)."""
+        """Use `BurstBus.take` of the open bus, where it has that."""
         self._take_received = getattr(self.link.bus, "take", None)
 
     def report(self, axis: int | None, kind: EventKind, code: int, text: str) -> None:
@@ -113,7 +113,8 @@ class CycleBus:
         begun_ns = self.clock()
         while (message := recv(0.0)) is not None:
             yield message
-            if self.check_lag(self.clock() - begun_ns):
+            reading_ns = self.clock() - begun_ns
+            if self.check_lag(reading_ns):
                 return
 
     def read_waiting(self) -> None:
@@ -133,18 +134,17 @@ class CycleBus:
         return self._take_received()
 
     def check_lag(self, behind_ns: int) -> bool:
-        """Return whether the reader is more than `LARGEST_LAG_NS` late.
+        """Return whether the reader is more than `LARGEST_LAG_NS` behind the bus.
 
-        The first time adds a fault. It is added once, because the counters show whether frames
-        were lost.
+        The first time adds a fault; whether frames were lost as well is in the counts.
         """
-        late = behind_ns > LARGEST_LAG_NS
-        if late and not self._reported_late:
+        is_late = behind_ns > LARGEST_LAG_NS
+        if is_late and not self._reported_late:
             self._reported_late = True
             remedy = "moving axes cannot be watched; reduce the load of this computer"
             reason = f"read {behind_ns * 1e-9:.1f} s late: {remedy}"
             self.faults.append(BusError(str(self.link.address), reason))
-        return late
+        return is_late
 
     def take_outgoing(self) -> Sequence[can.Message]:
         """Return the frames to send now, and remove them from `outgoing`."""
@@ -164,7 +164,7 @@ class Cycles(ABC):
 
     def __init__(self, bus: CycleBus) -> None:
         self.bus = bus
-        #: SYNC of the next cycle, if it ended the last one
+        #: SYNC of the next cycle, where its arrival ended the last one; it was read already
         self.early_sync: can.Message | None = None
 
     def begin(self) -> Cycles:

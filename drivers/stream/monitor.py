@@ -29,15 +29,15 @@ QUIET_S = 2.0  #: Silence of other masters after which the axes are read by SDO
 ANSWER_S = 0.3
 #: A request without an answer for so long is lost, and the objects are read from the first again
 ABANDONED_S = 1.0
-#: Time between two SDO readings of an axis: six axes then load a bus of 1 Mbit/s by some 5 %
+#: Time between two sets of SDO requests to an axis; six axes then load a bus of 1 Mbit/s by 5 %
 READING_S = 0.1
 
 
 class ReadingSource(Enum):
     """Origin of the readings."""
 
-    OVERHEARD = "overheard"
-    ASKED = "asked"
+    OVERHEARD = "overheard"  #: answers to the SYNC of another master
+    ASKED = "asked"  #: SDO uploads of our own
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +56,7 @@ class AxisReading:
     current_raw: int | None  #: last value, None before the first
     statusword: int | None  #: last value, None before the first
     nmt: int | None  #: state in its last heartbeat, None before the first
-    rate_hz: float  #: of complete readings since the last reading
+    rate_hz: float  #: of complete sets of these values since the last reading
     lost: int  #: SYNCs or requests without an answer since the monitor began
     #: whether the axis sent anything since the last reading, or in the last ABANDONED_S
     heard: bool = True
@@ -89,9 +89,9 @@ class CellReading:
 
 
 class _AxisWatch:
-    """Last values of one axis, and its pending answers.
+    """Last values of one axis, and the answers that it still owes.
 
-    A reading has one value of each of `entries`. A column is an index of `entries`.
+    A set has one value of each of `entries`. A column is an index of `entries`.
     """
 
     def __init__(self, axis: Axis) -> None:
@@ -101,14 +101,14 @@ class _AxisWatch:
         self.values: list[int | None] = [None] * len(self.entries)
         self.answered: set[int] = set()  # COB-IDs of the answers to the last SYNC
         self.has_answered = False  # whether an earlier SYNC was answered completely
-        self.readings = 0  # complete ones since the last `take`
-        self.lost = 0
-        self.complete_ns: int | None = None  # when the last complete reading by SDO came
-        self.requested = -1  # column of the last request, -1 before the first of a reading
+        self.sets = 0  # complete ones since the last `take`
+        self.lost = 0  # SYNCs or requests without an answer
+        self.complete_ns: int | None = None  # when the last complete set by SDO came
+        self.requested = -1  # column of the last request, -1 before the first of a set
         self.request_ns: int | None = None  # when the open request was sent
-        self.next_reading_ns = 0
-        self.heard_ns: int | None = None
-        self.longest_delay_ns: int | None = None
+        self.next_set_ns = 0  # when the next set is due
+        self.heard_ns: int | None = None  # when it last sent anything
+        self.longest_delay_ns: int | None = None  # of an answer since the last `take`
         self.refused: dict[int, ObjectRefusal] = {}  # by column
 
     @property
@@ -117,10 +117,17 @@ class _AxisWatch:
         return self.answered == self.slots.keys()
 
     def take(self, nmt: int | None, since_ns: int, now_ns: int) -> AxisReading:
-        """Return a reading and begin the next."""
+        """Return a reading and begin the next.
+
+        Args:
+            nmt: state in its last heartbeat, None before the first.
+            since_ns: time of the last reading by the clock [ns].
+            now_ns: time by the clock [ns].
+        """
         position, current, statusword = self.values
         lasted_s = max((now_ns - since_ns) * 1e-9, 1e-9)
-        abandoned_ns = min(since_ns, now_ns - round(ABANDONED_S * 1e9))
+        # An axis that sent nothing since then is silent.
+        silent_since_ns = min(since_ns, now_ns - round(ABANDONED_S * 1e9))
         refused = [self.refused[column] for column in sorted(self.refused)]
         delay_s = None
         if self.longest_delay_ns is not None:
@@ -130,13 +137,13 @@ class _AxisWatch:
             current_raw=current,
             statusword=statusword,
             nmt=nmt,
-            rate_hz=self.readings / lasted_s,
+            rate_hz=self.sets / lasted_s,
             lost=self.lost,
-            heard=self.heard_ns is not None and self.heard_ns >= abandoned_ns,
+            heard=self.heard_ns is not None and self.heard_ns >= silent_since_ns,
             delay_s=delay_s,
             refused=tuple(refused),
         )
-        self.readings = 0
+        self.sets = 0
         self.longest_delay_ns = None
         return reading
 
@@ -151,7 +158,7 @@ class _AxisWatch:
             self.refused.pop(column, None)
         self.answered.add(cob_id)
         if self.is_complete:
-            self.readings += 1
+            self.sets += 1
 
     def hear_sync(self) -> None:
         """End the time for answers to the SYNC before.
@@ -166,10 +173,13 @@ class _AxisWatch:
 
     def hear_answer(self, data: bytes, now_ns: int) -> None:
         """Take an SDO answer to the open request, however late it comes."""
+        if self.request_ns is None:
+            # An answer to another program
+            return
         column = self.requested
         entry = self.entries[column]
         answer = upload_answer(data, entry)
-        if self.request_ns is None or answer is None:
+        if answer is None:
             # An answer to another program
             return
         delay_ns = now_ns - self.request_ns
@@ -182,22 +192,22 @@ class _AxisWatch:
             self.refused.pop(column, None)
         is_last = column == len(self.entries) - 1
         if is_last and not self.refused:
-            self.readings += 1
+            self.sets += 1
             self.complete_ns = now_ns
 
     def next_request(self, now_ns: int) -> ObjectEntry | None:
-        """Return the object to request now; None while an answer or a reading is awaited."""
+        """Return the object to request now; None while an answer is awaited, or no set is due."""
         if self.request_ns is not None:
             if now_ns < self.request_ns + round(ABANDONED_S * 1e9):
                 return None
             self.lost += 1
-            # From the first object again: the values of a reading belong together.
+            # From the first object again: the values of a set belong together.
             self.abandon_request()
         column = (self.requested + 1) % len(self.entries)
         if column == 0:
-            if now_ns < self.next_reading_ns:
+            if now_ns < self.next_set_ns:
                 return None
-            self.next_reading_ns = now_ns + round(READING_S * 1e9)
+            self.next_set_ns = now_ns + round(READING_S * 1e9)
         self.requested = column
         self.request_ns = now_ns
         return self.entries[column]
@@ -233,11 +243,9 @@ class CellMonitor:
             taken: whether a recorder has taken the bus and listens before it sends; from then on
                 nothing is sent, because the recorder refuses a bus on which it hears requests.
         """
+        #: Period of SYNC, with which SYNCs that this program missed leave a gap in the samples'
+        #: cycles; None to count only those that were heard.
         self.period_ns: int | None = None
-        """Period of SYNC; SYNCs that this program missed then leave a gap in the samples' cycles.
-
-        None counts SYNCs.
-        """
         self._link = link
         self._on_sample = on_sample
         self._wall_minus_monotonic_ns = wall_minus_monotonic_ns
@@ -328,6 +336,7 @@ class CellMonitor:
                 self._frames[bus, len(request.data)] += 1
 
     def _hear(self, message: can.Message) -> None:
+        """Process a frame: count it, and give it to the axis that it is about."""
         bus = 0
         if self._split is not None:
             bus = self._buses.index(str(message.channel))
@@ -337,9 +346,9 @@ class CellMonitor:
             return
         identifier = message.arbitration_id
         data = bytes(message.data)
-        axis = self._by_node.get(identifier & 0x7F)
-        if axis is not None and identifier & ~0x7F in FROM_NODES:
-            axis.heard_ns = self._link.clock()
+        sender = self._by_node.get(identifier & 0x7F)
+        if sender is not None and identifier & ~0x7F in FROM_NODES:
+            sender.heard_ns = self._link.clock()
         answering = self._by_node.get(identifier - SDO_ANSWER)
         is_sdo_request = SDO_REQUEST <= identifier < SDO_REQUEST + 0x80
         if identifier == SYNC_COB_ID:
@@ -376,9 +385,10 @@ class CellMonitor:
         missing = [not axis.is_complete for axis in self._axes]
         self._emit(last_ns, missing)
         if self.period_ns is not None:
-            # Frames without time stamps all have 0: their cycles are counted.
+            # Frames without time stamps all have 0: then no period counts as missed.
             periods = round((stamp_s - last_stamp_s) * 1e9 / self.period_ns)
-            self._cycle += max(0, periods - 1)
+            missed = max(0, periods - 1)
+            self._cycle += missed
 
     def _sample_asked(self, now_ns: int) -> None:
         """Make a sample of the last values, if it is due."""
@@ -389,11 +399,12 @@ class CellMonitor:
         oldest_ns = now_ns - round((2 * READING_S + ANSWER_S) * 1e9)
         missing = []
         for axis in self._axes:
-            missing.append(axis.complete_ns is None or axis.complete_ns < oldest_ns)
+            is_missing = axis.complete_ns is None or axis.complete_ns < oldest_ns
+            missing.append(is_missing)
         self._emit(now_ns, missing)
 
     def _emit(self, time_ns: int, missing: list[bool]) -> None:
-        """Pass on a sample; `missing` says of each axis whether it did not answer."""
+        """Pass on a sample of the last values; `missing` says which axes did not answer."""
         by_axis = []
         missing_bits = 0
         for number, axis in enumerate(self._axes):

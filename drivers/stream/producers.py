@@ -16,6 +16,7 @@ import os
 import socket
 import struct
 from contextlib import AbstractContextManager
+from dataclasses import dataclass
 from math import ceil
 
 from drivers.canopen.bus import BusAddress
@@ -28,40 +29,43 @@ from drivers.profiles.profile import ObjectEntry
 from drivers.stream.sync import Producer
 
 SYNC_COB_ID_OBJECT = ObjectEntry(0x1005, 0, 32)
+#: Period [us]; a producer sends no SYNC while it is 0 (CiA 301)
 CYCLE_PERIOD = ObjectEntry(0x1006, 0, 32)
-"""Period [us]; a producer sends no SYNC while it is 0 (CiA 301)."""
-PRODUCES = 1 << 30
+PRODUCES = 1 << 30  #: Bit of 1005h
 #: Time for which the kernel goes on alone; less than the 0.5 s of the amplifiers' own watch
 LEASE_S = 0.4
-LEAST_SYNCS = 3
+LEAST_SYNCS = 3  #: In this time, also at a long period
 RENEWAL_S = 0.025  #: Time between two renewals
 STEERING_S = 0.25  #: Time between two corrections of the kernel's interval
+#: Fraction of the period; a kernel that is later than that produces time stamps which are refused
 LARGEST_CORRECTION = 0.2
-"""Fraction of the period; a kernel that is later than that produces time stamps which are
-refused.
-"""
 # linux/can/bcm.h
 _TX_SETUP = 1
 _SET_TIMER = 0x1
 _SET_AND_START_TIMER = 0x3
-# struct bcm_msg_head: opcode, flags, count, two intervals of (s, us), identifier, number of frames;
-# then can_frame.
+# struct bcm_msg_head: opcode, flags, count, two intervals of (s, us), identifier, number of frames.
+# `0q` pads it to the alignment of the can_frame that follows.
 _HEAD = struct.Struct("@3I4l2I0q")
 
 
 def steered_us(period_us: int, interval_us: int, late_ns: int, phase_ns: int, periods: int) -> int:
-    """Return the kernel's interval for the next window of so many periods [us].
+    """Return the kernel's interval for the next window of SYNCs [us].
 
-    The lateness of the last window (`late_ns`) is expected again, and the lateness of its last SYNC
-    in the whole schedule (`phase_ns`) is to be corrected within one window.
+    The lateness of the last window is expected again, and the lateness in the schedule is corrected
+    within one window.
+
+    Args:
+        period_us: of the schedule [us].
+        interval_us: of the last window [us].
+        late_ns: time by which the last window was too long [ns].
+        phase_ns: time by which its last SYNC was late in the schedule [ns].
+        periods: in a window.
     """
-    wanted_us = interval_us - (late_ns + phase_ns) / (1000 * periods)
-    return round(
-        min(
-            max(wanted_us, (1.0 - LARGEST_CORRECTION) * period_us),
-            (1.0 + LARGEST_CORRECTION) * period_us,
-        )
-    )
+    correction_us = (late_ns + phase_ns) / (1000 * periods)
+    shortest_us = (1.0 - LARGEST_CORRECTION) * period_us
+    longest_us = (1.0 + LARGEST_CORRECTION) * period_us
+    bounded_us = min(max(interval_us - correction_us, shortest_us), longest_us)
+    return round(bounded_us)
 
 
 def setup_message(flags: int, interval_us: int) -> bytes:
@@ -90,14 +94,17 @@ class KernelProducer(Producer, AbstractContextManager["KernelProducer"]):
         self._link = network.link
         self._socket: socket.socket | None = None
         self._interval_us = period_us
-        self._window = max(8, round(STEERING_S * 1e6 / period_us))
-        self._begun_ns = self._phase_ns = self._periods = self._renewed_ns = 0
+        self._window_periods = max(8, round(STEERING_S * 1e6 / period_us))
+        self._window_begun_ns = 0  # by the SYNC that began it
+        self._periods = 0  # since then
+        self._phase_ns = 0  # time by which that SYNC was late in the schedule
+        self._renewed_ns = 0
 
     def __exit__(self, *_: object) -> None:
         self.stop()
 
     def start(self) -> None:
-        """Send SYNC from now on, or again; while it runs, this counts as `seen`.
+        """Send SYNC from now on: the first at once, and all after it count from that one.
 
         Raises:
             BusError: the kernel has no broadcast manager, or the bus is not SocketCAN.
@@ -113,41 +120,44 @@ class KernelProducer(Producer, AbstractContextManager["KernelProducer"]):
             self._socket.send(setup_message(_SET_AND_START_TIMER, self._interval_us))
         except OSError as error:
             self.stop()
-            name = errno.errorcode.get(error.errno or 0, "")
-            reason = (
-                f"SYNC by the kernel: {os.strerror(error.errno or 0)} {name}; modprobe can-bcm?"
-            )
+            number = error.errno or 0
+            name = errno.errorcode.get(number, "")
+            reason = f"SYNC by the kernel: {os.strerror(number)} {name}; modprobe can-bcm?"
             raise BusError(str(address), reason) from error
 
     def seen(self, monotonic_ns: int, periods: int) -> None:
-        """Process a SYNC and its periods since the one before, 0 for the first;
-        keeps average period and phase.
+        """Process a SYNC and its periods since the one before, 0 for the first.
+
+        It renews the lease, and once a window corrects the interval.
         """
-        if self._socket is not None and not 0 <= monotonic_ns - self._renewed_ns < RENEWAL_S * 1e9:
-            # The timer itself is not started again, if it has ended: the recorder was stopped for
-            # too long.
+        since_renewal_ns = monotonic_ns - self._renewed_ns
+        is_renewed = 0 <= since_renewal_ns < RENEWAL_S * 1e9
+        if self._socket is not None and not is_renewed:
+            # A timer that has ended is not started again: the recorder was stopped for too long.
             self._renewed_ns = monotonic_ns
             self._socket.send(setup_message(_SET_TIMER, self._interval_us))
         if periods == 0:
-            self._begun_ns = monotonic_ns
+            self._window_begun_ns = monotonic_ns
             self._phase_ns = 0
             self._periods = 0
             return
         self._periods += periods
-        if self._periods < self._window or self._socket is None:
+        if self._periods < self._window_periods or self._socket is None:
             return
-        late_ns = monotonic_ns - self._begun_ns - 1000 * self.period_us * self._periods
+        lasted_ns = monotonic_ns - self._window_begun_ns
+        late_ns = lasted_ns - 1000 * self.period_us * self._periods
         self._phase_ns += late_ns
         interval_us = steered_us(
             self.period_us, self._interval_us, late_ns, self._phase_ns, self._periods
         )
-        self._begun_ns = monotonic_ns
+        self._window_begun_ns = monotonic_ns
         self._periods = 0
         if interval_us != self._interval_us:
             self._interval_us = interval_us
             self._socket.send(setup_message(_SET_TIMER, interval_us))
 
     def rest(self) -> None:
+        """Stop sending: the next start begins a new phase."""
         self.pause()
 
     def pause(self) -> None:
@@ -162,16 +172,28 @@ class KernelProducer(Producer, AbstractContextManager["KernelProducer"]):
         self._link.sync_producer = None
 
 
+@dataclass(frozen=True, slots=True)
+class _SyncObjects:
+    """Values of the SYNC objects of a drive."""
+
+    cob_id: int  #: 1005h
+    period_us: int  #: 1006h
+
+
 class DriveProducer(Producer, AbstractContextManager["DriveProducer"]):
-    """SYNC by a drive of the cell, `axis` by its index:
-    objects 1005h (bit 30) and 1006h, which are restored.
+    """SYNC by a drive of the cell: by its objects 1005h (bit 30) and 1006h, which are restored.
+
+    Args:
+        network: of the drive.
+        axis: its index.
+        period_us: of SYNC [us].
     """
 
     def __init__(self, network: CanopenNetwork, axis: int, period_us: int) -> None:
         super().__init__(network.axes[axis].name, period_us)
         self._network = network
         self._node_id = network.node_ids[axis]
-        self._before: tuple[int, int] | None = None
+        self._before: _SyncObjects | None = None  # None unless started
         self._produces = False
 
     def __exit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
@@ -185,14 +207,16 @@ class DriveProducer(Producer, AbstractContextManager["DriveProducer"]):
             error.add_note(f"{WHILE}stopping SYNC: {problem}")
 
     def start(self) -> None:
-        """Let the drive send SYNC; nothing happens if it does."""
+        """Let the drive send SYNC; where it does so already, nothing is written."""
         if self._produces:
             return
         access = self._network.link.objects(self._node_id)
         if self._before is None:
-            self._before = (access.read(SYNC_COB_ID_OBJECT), access.read(CYCLE_PERIOD))
+            cob_id = access.read(SYNC_COB_ID_OBJECT)
+            period_us = access.read(CYCLE_PERIOD)
+            self._before = _SyncObjects(cob_id, period_us)
         self._network.link.sync_producer = self.name
-        # CiA 301: the period may be refused while the drive produces, so production begins last and
+        # Drives may refuse another period while they produce SYNC, so production begins last and
         # ends first.
         access.write(SYNC_COB_ID_OBJECT, SYNC_COB_ID)
         access.write(CYCLE_PERIOD, self.period_us)
@@ -202,9 +226,8 @@ class DriveProducer(Producer, AbstractContextManager["DriveProducer"]):
     def pause(self) -> None:
         """Tell the drive to stop, without waiting for its answer; `stop` restores its objects."""
         if self._before is not None:
-            self._network.link.send(
-                (download_request(self._node_id, SYNC_COB_ID_OBJECT, SYNC_COB_ID),)
-            )
+            request = download_request(self._node_id, SYNC_COB_ID_OBJECT, SYNC_COB_ID)
+            self._network.link.send((request,))
             self._produces = False
 
     def stop(self) -> None:
@@ -215,10 +238,12 @@ class DriveProducer(Producer, AbstractContextManager["DriveProducer"]):
         try:
             if before is not None and self._node_id not in self._network.link.silent:
                 access = self._network.link.objects(self._node_id)
-                access.write(SYNC_COB_ID_OBJECT, before[0] & ~PRODUCES)
-                access.write(CYCLE_PERIOD, before[1])
-                if before[0] & PRODUCES:
-                    access.write(SYNC_COB_ID_OBJECT, before[0])
+                # CiA 301, 1005h: bits 0 to 29 must not change while bit 30 is set. So production
+                # ends first, and another identifier comes back in a write of its own.
+                access.write(SYNC_COB_ID_OBJECT, SYNC_COB_ID)
+                access.write(CYCLE_PERIOD, before.period_us)
+                if before.cob_id != SYNC_COB_ID:
+                    access.write(SYNC_COB_ID_OBJECT, before.cob_id)
         finally:
             self._network.link.sync_producer = None
 

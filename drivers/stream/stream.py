@@ -70,13 +70,14 @@ class SyncStream:
         )
         self._watch = Watch(network, self.bus, real_time=not pacing.waits_for_answers)
         self._cycles: Cycles = pacing.cycles(self.bus)
-        self._last_wrong_length: dict[int, int] = {}  # cycle, by COB-ID
-        # Whether late frames were read since the last cycle
-        self._has_read_late = False
-        self._losses_before = Losses()  # the first SYNC
-        self._losses = Losses()
-        self._incomplete_cycles = 0  # in a row
-        self._silent_cycles = 0  # in a row
+        # Cycle of the last PDO of wrong length, by COB-ID
+        self._last_wrong_length: dict[int, int] = {}
+        # Whether `read_on` was called since the last cycle
+        self._has_read_on = False
+        self._losses_at_begin = Losses()
+        self._losses = Losses()  # those reported so far, and those at the begin
+        self._incomplete_cycles = 0  # the last ones in a row
+        self._silent_cycles = 0  # the last ones in a row
 
     @property
     def time_ns(self) -> int:
@@ -86,7 +87,7 @@ class SyncStream:
     @property
     def statistics(self) -> StreamStatistics:
         """Counts up to now."""
-        losses = self._losses.since(self._losses_before)
+        losses = self._losses.since(self._losses_at_begin)
         return StreamStatistics(
             cycles=self.bus.cycles,
             skipped_periods=self.bus.skipped,
@@ -115,7 +116,7 @@ class SyncStream:
             BusError: the bus is lost.
             NodeMisplaced: as `next`.
         """
-        self._has_read_late = False
+        self._has_read_on = False
         try:
             with bus_errors(self._link.address):
                 if self.bus.cycles == 0:
@@ -123,6 +124,9 @@ class SyncStream:
                 self._open_cycle()
                 self._collect()
         except (BusError, NodeMisplaced) as error:
+            if self.bus.cycles > 0:
+                # No later cycle may report what was lost before the failure.
+                self._note_losses()
             self.bus.report(None, EventKind.BUS_LOST, 0, str(error))
             raise
         return self._finish_cycle()
@@ -131,8 +135,8 @@ class SyncStream:
         """Discard the frames from before the first SYNC; losses before it do not count."""
         self.bus.begin()
         self._cycles = self._cycles.begin()
-        self._losses_before = losses_of(self._link.bus)
-        self._losses = self._losses_before
+        self._losses_at_begin = losses_of(self._link.bus)
+        self._losses = self._losses_at_begin
         for remark in remarks_of(self._link.bus):
             self.bus.report(None, EventKind.CAPTURE, 0, remark)
 
@@ -212,10 +216,14 @@ class SyncStream:
             BusError: the bus is lost, and with it the last reports.
             NodeMisplaced: as `next`.
         """
-        is_first_call = not self._has_read_late
-        self._has_read_late = True
-        with bus_errors(self._link.address):
-            self._read_late(seconds, lag_s, count_answers=is_first_call)
+        is_first_call = not self._has_read_on
+        self._has_read_on = True
+        try:
+            with bus_errors(self._link.address):
+                self._read_late(seconds, lag_s, count_answers=is_first_call)
+        except (BusError, NodeMisplaced):
+            self._note_losses()
+            raise
         self._note_losses()
         self._watch.note_events()
 
@@ -256,10 +264,17 @@ class SyncStream:
                 end_ns = max(end_ns, clock() + duration_ns)
                 end_ns = min(end_ns, latest_end_ns)
             slot = self._slot_of(message)
-            if slot is None or (count_answers and not in_cycle):
-                self._process_between_cycles(message)
-            elif count_answers and len(message.data) == slot.length:
-                answers.take(message.arbitration_id, slot, message.data)
+            if slot is None:
+                self._process_other(message)
+            elif count_answers:
+                self._count_late_answer(slot, message, in_cycle=in_cycle)
+
+    def _count_late_answer(self, slot: Slot, message: can.Message, *, in_cycle: bool) -> None:
+        """Count an answer after the last cycle; `in_cycle` after another SYNC."""
+        if not in_cycle:
+            self._process_between_cycles(message)
+        elif len(message.data) == slot.length:
+            self._answers.take(message.arbitration_id, slot, message.data)
 
     def _process_between_cycles(self, message: can.Message) -> None:
         """Process a frame that is read after a cycle has ended and before the next SYNC."""
@@ -288,7 +303,8 @@ class SyncStream:
 
     def _finish_cycle(self) -> Sample:
         """Return the sample of the cycle, after its faults and losses are noted."""
-        # A skipped period has a number too, so that a gap is visible in the samples.
+        # The first cycle has number 0. A skipped period has a number too, so that a gap is visible
+        # in the samples.
         cycle = self.bus.cycles - 1 + self.bus.skipped
         missing = self._answers.end()
         if missing:

@@ -18,7 +18,14 @@ from drivers.canopen.sdo import SDO_REQUEST
 from drivers.errors import BusBusy, DriveFault, node_label
 from drivers.messages import CellEvent, EventKind, Sample
 from drivers.move import Move, Trapezoid
-from drivers.profiles.cia402 import STATE_BITS, STATUS_FAULT, STATUS_FOLLOWING_ERROR, State, decode
+from drivers.profiles.cia402 import (
+    FAULTY,
+    STATE_BITS,
+    STATUS_FAULT,
+    STATUS_FOLLOWING_ERROR,
+    State,
+    decode,
+)
 from drivers.profiles.profile import Axis
 from drivers.stream.cycles import CycleBus
 
@@ -41,7 +48,8 @@ class FrozenData:
     """Detection of moving axes whose data do not change.
 
     Args:
-        move: its set-points are being sent; the first sample is the one at which they begin.
+        move: the move that the axes make; the first sample is the one at which it begins, or a
+            later one.
         start_counts: position of every axis before the move.
         axes: indices of the axes that move.
         period_ns: period of the samples.
@@ -131,10 +139,12 @@ class ToggleBits:
         i) its interval starts again.
         """
         for watched in self._bits:
-            if missing >> watched.axis & 1:
+            is_missing = missing >> watched.axis & 1
+            if is_missing:
                 self._states.pop(watched.axis, None)
                 continue
-            value = statuswords[watched.axis] >> watched.bit & 1
+            word = statuswords[watched.axis]
+            value = word >> watched.bit & 1
             state = self._states.get(watched.axis)
             if state is None or value != state.value:
                 self._states[watched.axis] = _ToggleState(value, time_ns)
@@ -161,8 +171,9 @@ class _LastHeartbeat:
     """The last heartbeat of a node, and when its silence began."""
 
     heard_ns: int  #: time of the heartbeat by the clock; 0 before the first one
-    silent_since_clock_ns: int  #: by the clock
-    silent_since_sample_ns: int  #: in the time of the samples
+    #: By the clock: that heartbeat, or the report of a silence after it
+    silent_since_clock_ns: int
+    silent_since_sample_ns: int  #: the same in the time of the samples
 
 
 class Watch:
@@ -209,7 +220,7 @@ class Watch:
         self._has_begun = True
 
     def _check_limits(self, time_ns: int) -> None:
-        """Report limits that have been active for more than LIMIT_S."""
+        """Report limits that have been active for more than LIMIT_S, and add a fault for each."""
         for axis, since_ns in tuple(self._limited_since_ns.items()):
             word = self._statuswords[axis]
             if decode(word) is not State.OPERATION_ENABLED:
@@ -238,21 +249,26 @@ class Watch:
         previous_words = self._statuswords
         self._statuswords = statuswords
         for axis, word in enumerate(statuswords):
-            is_first = bool(self._unheard_mask >> axis & 1)
-            if is_first and missing >> axis & 1:
+            axis_mask = 1 << axis
+            is_first = bool(self._unheard_mask & axis_mask)
+            if is_first and missing & axis_mask:
                 continue  # no word was received yet
-            self._unheard_mask &= ~(1 << axis)
-            saturation_bit = self._network.axes[axis].profile.saturation_bit
+            self._unheard_mask &= ~axis_mask
             if is_first:
                 self._report_state(axis, word)
+                # A limit that is active from the start is reported as well.
                 changed = word
             else:
                 changed = word ^ previous_words[axis]
                 if changed & _WATCHED_BITS:
                     self._report_state(axis, word)
                     self._note_faults(axis, word, changed)
-            if saturation_bit is not None and changed >> saturation_bit & 1:
-                is_active = bool(word >> saturation_bit & 1)
+            saturation_bit = self._network.axes[axis].profile.saturation_bit
+            if saturation_bit is None:
+                continue
+            saturation_mask = 1 << saturation_bit
+            if changed & saturation_mask:
+                is_active = bool(word & saturation_mask)
                 self._note_limit(axis, word, is_active=is_active)
 
     def _report_state(self, axis: int, word: int) -> None:
@@ -272,8 +288,7 @@ class Watch:
         """
         node = self._network.axes[axis]
         state = decode(word)
-        is_fault = state in (State.FAULT, State.FAULT_REACTION_ACTIVE)
-        if is_fault and changed & STATUS_FAULT:
+        if state in FAULTY and changed & STATUS_FAULT:
             self._bus.faults.append(DriveFault(node, str(state), word))
         if changed & word & STATUS_FOLLOWING_ERROR:
             text = self._state_text(axis, word)

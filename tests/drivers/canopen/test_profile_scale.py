@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.canopen.scale import FINE, ScaleReading, check_nameplate, read_scale
+from drivers.canopen.scale import LARGEST_KT_RATIO, ScaleReading, check_nameplate, read_scale
 from drivers.canopen.sdo import ObjectAccess
 from drivers.errors import ObjectAccessError, SetupRefused
 from drivers.profiles.profile import (
@@ -163,8 +163,10 @@ def test_nameplates_agree_or_warn_by_their_ratio(
     reported = reading(current_a, torque_nm)
     declared = sign * torque_nm / current_a / ratio
     spread = max(ratio, 1.0 / ratio)
-    if not FINE * 0.9999 < spread < FINE * 1.0001:
-        assert bool(check_nameplate(reported, Amplitude.RMS, declared)) is (spread > FINE)
+    if not LARGEST_KT_RATIO * 0.9999 < spread < LARGEST_KT_RATIO * 1.0001:
+        assert bool(check_nameplate(reported, Amplitude.RMS, declared)) is (
+            spread > LARGEST_KT_RATIO
+        )
 
 
 @pytest.mark.parametrize("ratio", [math.sqrt(2.0), math.sqrt(0.5)])

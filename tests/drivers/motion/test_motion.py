@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager, nullcontext, suppress
 from dataclasses import replace
 
@@ -17,6 +17,7 @@ from drivers.errors import (
     MotionRefused,
     MotionTimeout,
     NodeMisplaced,
+    NodeMissing,
     SampleLost,
     StateRefused,
 )
@@ -714,3 +715,29 @@ def test_a_bus_that_ends_the_stop_by_pdo_does_not_keep_the_others_from_being_sto
     assert powerless(bus)
     assert EventKind.BUS_LOST in [event.kind for event in events]
     assert EventKind.STOP_UNCONFIRMED in [event.kind for event in events]
+
+
+def test_a_second_failure_during_a_stop_does_not_keep_the_axes_from_being_stopped(
+    moving: Moving, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each failure is raised once; the stop then goes on by SDO on the buses that are left."""
+    network, _, bus, events = moving
+    find_silent = network.find_silent
+    misplaced = NodeMisplaced(9, "A", "B")
+    bus_off = BusError("bus B", "bus-off")
+
+    def fail_by_pdo(_cycle: int) -> None:
+        if EventKind.STOP in [event.kind for event in events]:
+            bus.on_cycle = lambda _cycle: None
+            raise misplaced
+
+    def fail_once(_axes: Sequence[Axis]) -> NodeMissing | None:
+        monkeypatch.setattr(network, "find_silent", find_silent)
+        raise bus_off
+
+    bus.on_cycle = fail_by_pdo
+    monkeypatch.setattr(network, "find_silent", fail_once)
+    with pytest.raises(NodeMisplaced) as stopped:
+        run(moving, both_by(5_000))
+    assert powerless(bus)
+    assert str(bus_off) in " ".join(stopped.value.__notes__)

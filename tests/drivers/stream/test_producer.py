@@ -9,7 +9,7 @@ import pytest
 
 from drivers.errors import BusError, ObjectAccessError
 from drivers.stream.producers import PRODUCES, DriveProducer, KernelProducer, setup_message
-from tests.drivers.scripted import ScriptedBus, ScriptedNode, cell
+from tests.drivers.scripted import ScriptedBus, ScriptedNode, abort_answer, cell
 
 PERIOD_US = 2000
 
@@ -51,10 +51,34 @@ def test_a_drive_produces_last_and_gets_its_objects_back(cob_id: int, period_us:
             ]
             bus.sent.clear()
         assert network.link.sync_producer is None
-        expected = (0x1005, cob_id & ~PRODUCES)
-        assert written(bus, 2)[0] == expected  # it falls silent first
+        assert written(bus, 2)[0] == (0x1005, 0x80)  # it falls silent first
         assert node.value(0x1005, 0) == cob_id
         assert node.value(0x1006, 0) == period_us
+
+
+def test_a_drive_whose_identifier_is_fixed_while_it_produces_gets_its_own_back(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """CiA 301, 1005h: bits 0 to 29 must not change while bit 30 is 1."""
+    network, bus = cell()
+    node = with_sync_objects(bus.nodes[1], 0x85, 500)
+    answer = node.sdo
+
+    def strict_answer(data: bytes) -> bytes | None:
+        is_write = data[0] >> 5 == 1
+        if is_write and data[1:4] == bytes((0x05, 0x10, 0)):
+            before = node.value(0x1005, 0)
+            changed = before ^ int.from_bytes(data[4:8], "little")
+            if before & PRODUCES and changed & (PRODUCES - 1):
+                return abort_answer(0x1005, 0, 0x06090030)
+        return answer(data)
+
+    monkeypatch.setattr(node, "sdo", strict_answer)
+    with network:
+        with DriveProducer(network, 1, PERIOD_US) as producer:
+            producer.start()
+        assert node.value(0x1005, 0) == 0x85
+        assert node.value(0x1006, 0) == 500
 
 
 def test_a_drive_pauses_without_being_waited_for_and_starts_again() -> None:

@@ -909,6 +909,26 @@ def test_frames_that_this_machine_lost_are_counted_and_reported(lockstep: Prepar
     assert times_ns == {sample.time_ns}
 
 
+@pytest.mark.parametrize("after_the_last_cycle", [False, True])
+def test_frames_that_were_lost_before_the_bus_failed_are_counted(
+    lockstep: Prepared, after_the_last_cycle: bool
+) -> None:
+    stream, bus, events = lockstep
+    bus.losses = Losses()
+    next(stream)
+    bus.losses = Losses(kernel=2)
+    bus.broken = True
+    with pytest.raises(BusError, match="the wire was cut"):
+        if after_the_last_cycle:
+            stream.read_on(0.25)
+        else:
+            next(stream)
+    bus.broken = False
+    assert stream.statistics.kernel_dropped == 2
+    (dropped,) = events_of(events, EventKind.FRAMES_DROPPED)
+    assert dropped.code == 2
+
+
 def test_what_is_to_be_known_of_the_bus_is_reported_at_the_start(lockstep: Prepared) -> None:
     stream, bus, events = lockstep
     bus.remarks = ("a small buffer",)
