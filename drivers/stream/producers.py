@@ -215,6 +215,10 @@ class DriveProducer(Producer, AbstractContextManager["DriveProducer"]):
             cob_id = access.read(SYNC_COB_ID_OBJECT)
             period_us = access.read(CYCLE_PERIOD)
             self._before = _SyncObjects(cob_id, period_us)
+            own_identifier = cob_id & ~PRODUCES
+            if cob_id & PRODUCES and own_identifier != SYNC_COB_ID:
+                # CiA 301, 1005h: bits 0 to 29 must not change while bit 30 is set.
+                access.write(SYNC_COB_ID_OBJECT, own_identifier)
         self._network.link.sync_producer = self.name
         # Drives may refuse another period while they produce SYNC, so production begins last and
         # ends first.
@@ -238,8 +242,7 @@ class DriveProducer(Producer, AbstractContextManager["DriveProducer"]):
         try:
             if before is not None and self._node_id not in self._network.link.silent:
                 access = self._network.link.objects(self._node_id)
-                # CiA 301, 1005h: bits 0 to 29 must not change while bit 30 is set. So production
-                # ends first, and another identifier comes back in a write of its own.
+                # Production ends first, and another identifier comes back in a write of its own.
                 access.write(SYNC_COB_ID_OBJECT, SYNC_COB_ID)
                 access.write(CYCLE_PERIOD, before.period_us)
                 if before.cob_id != SYNC_COB_ID:

@@ -56,12 +56,13 @@ def test_a_drive_produces_last_and_gets_its_objects_back(cob_id: int, period_us:
         assert node.value(0x1006, 0) == period_us
 
 
+@pytest.mark.parametrize("cob_id", [0x85, 0x85 | PRODUCES])
 def test_a_drive_whose_identifier_is_fixed_while_it_produces_gets_its_own_back(
-    monkeypatch: pytest.MonkeyPatch,
+    monkeypatch: pytest.MonkeyPatch, cob_id: int
 ) -> None:
     """CiA 301, 1005h: bits 0 to 29 must not change while bit 30 is 1."""
     network, bus = cell()
-    node = with_sync_objects(bus.nodes[1], 0x85, 500)
+    node = with_sync_objects(bus.nodes[1], cob_id, 500)
     answer = node.sdo
 
     def strict_answer(data: bytes) -> bytes | None:
@@ -77,7 +78,7 @@ def test_a_drive_whose_identifier_is_fixed_while_it_produces_gets_its_own_back(
     with network:
         with DriveProducer(network, 1, PERIOD_US) as producer:
             producer.start()
-        assert node.value(0x1005, 0) == 0x85
+        assert node.value(0x1005, 0) == cob_id
         assert node.value(0x1006, 0) == 500
 
 
