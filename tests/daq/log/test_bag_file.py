@@ -164,6 +164,12 @@ MANY_TOPICS = """
     CREATE VIEW topics AS WITH RECURSIVE n(id) AS (SELECT 1 UNION ALL SELECT id + 1 FROM n)
                           SELECT id, {name} AS name, '' AS type, '' AS serialization_format FROM n;
 """
+MORE_TOPICS = """
+    WITH RECURSIVE n(id) AS (SELECT 100 UNION ALL SELECT id + 1 FROM n WHERE id < 40000)
+    INSERT INTO topics (id, name, type, serialization_format, offered_qos_profiles,
+                        type_description_hash)
+    SELECT id, '/topic_' || id, hex(zeroblob(40)), 'cdr', '', '' FROM n;
+"""
 
 
 @pytest.mark.parametrize(
@@ -187,6 +193,7 @@ MANY_TOPICS = """
         ("UPDATE messages SET data = 5", "expected a topic, nanoseconds and bytes"),
         ("UPDATE messages SET data = x'00010000'", "/joint_states with a message of 4 bytes"),
         ("UPDATE topics SET offered_qos_profiles = '" + "[" * 100_000 + "'", None),
+        (MORE_TOPICS, None),
     ],
 )
 def test_a_hostile_database_is_refused_in_bounded_time(
