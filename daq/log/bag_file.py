@@ -182,7 +182,7 @@ def open_bag(path: Path) -> Iterator[McapBag | SqliteBag | Ros1Bag]:
     Damage behind these bytes is reported with the messages.
 
     Raises:
-        LogMissing: it cannot be opened.
+        LogMissing: it cannot be opened, or a packed one cannot be read.
         LogTruncated: it ends within the first bytes of a bag.
         LogForeign: it is of another kind.
         LogCorrupt: it is empty; or it is packed, and the content is damaged, empty, or larger than
@@ -261,27 +261,47 @@ def first_bytes(path: Path) -> bytes:
 
 
 def _unpack_file(path: Path, target: Path) -> None:
-    with open_regular(path) as packed:
-        packed_bytes = os.fstat(packed.fileno()).st_size
-        bytes_left = LARGEST_CHUNK + LARGEST_RATIO * packed_bytes
-        reader = zstandard.ZstdDecompressor().stream_reader(packed, read_across_frames=True)
-        try:
-            with target.open("wb") as stream:
-                while piece := reader.read(PIECE_BYTES):
-                    bytes_left -= len(piece)
-                    if bytes_left < 0:
-                        found = f"a file that unfolds to {LARGEST_RATIO} times its size"
-                        raise _not_unpacked(path, found)
-                    stream.write(piece)
-        except zstandard.ZstdError as error:
-            raise _not_unpacked(path, str(error)) from error
-        except OSError as error:
-            raise OutputFailed(
-                str(target),
-                found=reason_of(error),
-                expected=f"room for what {path.name} unfolds to",
-                remedy="free space, or name another folder in the environment variable TMPDIR",
-            ) from error
+    """Unpack a file; see `open_bag` for the errors."""
+    try:
+        with target.open("wb") as stream:
+            for piece in _unpacked_pieces(path):
+                stream.write(piece)
+    except OSError as error:
+        raise OutputFailed(
+            str(target),
+            found=reason_of(error),
+            expected=f"room for what {path.name} unfolds to",
+            remedy="free space, or name another folder in the environment variable TMPDIR",
+        ) from error
+
+
+def _unpacked_pieces(path: Path) -> Iterator[bytes]:
+    """Yield the unpacked content of a file.
+
+    Raises:
+        LogMissing: it cannot be read.
+        LogCorrupt: it is damaged, or its content is larger than that of a recording.
+    """
+    try:
+        with open_regular(path) as packed:
+            packed_bytes = os.fstat(packed.fileno()).st_size
+            bytes_left = LARGEST_CHUNK + LARGEST_RATIO * packed_bytes
+            reader = zstandard.ZstdDecompressor().stream_reader(packed, read_across_frames=True)
+            while piece := reader.read(PIECE_BYTES):
+                bytes_left -= len(piece)
+                if bytes_left < 0:
+                    found = f"a file that unfolds to {LARGEST_RATIO} times its size"
+                    raise _not_unpacked(path, found)
+                yield piece
+    except zstandard.ZstdError as error:
+        raise _not_unpacked(path, str(error)) from error
+    except OSError as error:
+        raise LogMissing(
+            str(path),
+            found=reason_of(error),
+            expected="a recording, packed by zstd",
+            remedy="copy it again from where it was recorded",
+        ) from error
 
 
 def _not_unpacked(path: Path, found: str) -> LogCorrupt:
