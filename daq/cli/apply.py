@@ -213,14 +213,14 @@ def apply_to(
     The write, with its entries in audit log and history, is done within `whole`.
     """
     from daq.report.proposal import proposal_report, show_proposal
-    from daq.writeback.judgement import query_history
+    from daq.writeback.judgement import read_history_figures
     from daq.writeback.target import apply, propose
 
     written: Written | None = None
     with opening as target:
         proposal = propose(target, request)
         edit = proposal.edit
-        known = query_history(declared, edit.subject, request, edit.changes)
+        known = read_history_figures(declared, edit.subject, request, edit.changes)
         if not json:
             show_proposal(proposal, output_console(), known)
         try:

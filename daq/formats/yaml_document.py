@@ -26,11 +26,11 @@ from daq.formats.scalar import (
     utf8,
 )
 
-#: Of a file: two parsers in Python read it before and after
+#: Limits of a file: two parsers in Python, which are slow, read it before and after a change
 MAX_BYTES = 2**19
 MAX_VALUES = 15_000
 MAX_DEPTH = 100
-_MERGE = "<<"
+_MERGE = "<<"  #: Key of YAML 1.1 that adds the keys of another mapping
 _TABS = re.compile(r"(?<=:)[ ]*\t[ \t]*|[ \t]*\t[ \t]*(?=#|\r|\n|\Z)")
 """Tabs after a key, before a comment and at the end of a line:
 white space in YAML 1.2 (6.1, 6.6) and to libyaml.
@@ -49,9 +49,8 @@ class YamlDocument(ControllerDocument):
     def locate(self, keys: tuple[str, ...]) -> tuple[Scalar, ...]:
         """See `ControllerDocument.locate`."""
         root = _composed(self.text, self.name, "1.2")
-        references = Counter[int]()
-        _count_references(root, references)
-        return tuple(self._locate(root, key, references) for key in keys)
+        visits = _count_visits(root)
+        return tuple(self._locate(root, key, visits) for key in keys)
 
     def readings(self) -> tuple[Values, Values]:
         """Read as YAML 1.2 and as YAML 1.1."""
@@ -62,7 +61,17 @@ class YamlDocument(ControllerDocument):
         """Read as YAML 1.2."""
         return _values(_composed(self.text, self.name, "1.2"))
 
-    def _locate(self, root: Node, key: str, references: Counter[int]) -> Scalar:
+    def _locate(self, root: Node, key: str, visits: Counter[int]) -> Scalar:
+        """Find the number of a key.
+
+        Args:
+            root: of the tree.
+            key: as in the cell configuration.
+            visits: of `_count_visits`.
+
+        Raises:
+            ControllerUnfit: there is none that can be changed on its own.
+        """
         node = root
         walked: KeyPath = ()
         for step in self.path_of(key):
@@ -70,22 +79,23 @@ class YamlDocument(ControllerDocument):
             walked = (*walked, step)
             # A value that another place refers to by an alias cannot be changed without changing
             # that place too.
-            if references[id(node)] > 1:
+            if visits[id(node)] > 1:
                 found = f"{'.'.join(walked)} shared by an anchor (&) and its alias (*)"
                 raise self.unfit(key, found, "write it out")
         if not isinstance(node, ScalarNode):
             raise self.unfit(key, "a list or mapping", "name the key of a number")
+        # The number is at the end of its node: an anchor or a tag may precede it. An escape within
+        # quotes makes its text another than its value.
         quote = node.style or ""
         end = node.end_mark.index - len(quote)
         start = end - len(node.value)
-        # An anchor or a tag may precede the number; an escape within quotes makes its text another
-        # than its value.
         before = self.text[start - 1 : start]
-        begins = start == node.start_mark.index or before.isspace()
         if quote:
-            begins = before == quote
-        is_literal = self.text[start:end] == node.value
-        if not begins or not is_literal or not DECIMAL.fullmatch(node.value):
+            is_at_begin = before == quote
+        else:
+            is_at_begin = start == node.start_mark.index or before.isspace()
+        is_literal = is_at_begin and self.text[start:end] == node.value
+        if not is_literal or not DECIMAL.fullmatch(node.value):
             raise self.unfit(key, f"{node.value!r:.60}", "write a plain decimal number")
         if OCTAL.fullmatch(node.value):
             found = (
@@ -93,8 +103,8 @@ class YamlDocument(ControllerDocument):
                 "those of 1.2"
             )
             raise self.unfit(key, found, "write it without leading zeros")
-        # Anchor and tag precede the number. A new gain has a point, and is no integer even where
-        # this one is.
+        # A tag may not make the number a text or an integer: a new gain has a point, and is no
+        # integer even where this one is.
         properties = self.text[node.start_mark.index : start].split()
         tags = [part for part in properties if part.startswith("!")]
         if tags and (tags[0] == "!" or node.tag != _FLOAT):
@@ -105,6 +115,11 @@ class YamlDocument(ControllerDocument):
         return self.decimal_scalar(key, node.value, start, line)
 
     def _child(self, node: Node, step: str, key: str, walked: KeyPath) -> Node:
+        """Return the child of a node at one step of a key; `walked` are the steps before.
+
+        Raises:
+            ControllerUnfit: there is none, or more than one.
+        """
         place = ".".join(walked) or "the file"
         if isinstance(node, SequenceNode) and step.isdecimal():
             position = int(step)
@@ -113,12 +128,17 @@ class YamlDocument(ControllerDocument):
                 return child
         if not isinstance(node, MappingNode):
             raise self.lacking(key, f"no key {step!r} in {place}")
-        named = [(name.value, value) for name, value in node.value if isinstance(name, ScalarNode)]
-        found: list[Node] = [value for name, value in named if name == step]
+        names: list[str] = []
+        found: list[Node] = []
+        for name, value in node.value:
+            if not isinstance(name, ScalarNode):
+                continue
+            names.append(str(name.value))
+            if name.value == step:
+                found.append(value)
         if len(found) > 1:
             raise self.unfit(key, f"{step!r} {len(found)} times in {place}", "remove all but one")
         if not found:
-            names = [str(name) for name, _ in named]
             if _MERGE in names:
                 text = f"no {step!r} of its own in {place}, which merges (<<) another"
                 raise self.unfit(key, text, "write it out")
@@ -138,7 +158,11 @@ def yaml_document(content: bytes, name: str) -> YamlDocument:
 
 
 def _check_size(content: bytes, name: str) -> None:
-    """Refuse at once what the two parsers would take minutes for."""
+    """Refuse a file for which the two parsers would take minutes.
+
+    Raises:
+        ControllerUnfit: it is too large.
+    """
     found = ""
     if len(content) > MAX_BYTES:
         found = f"{len(content)} bytes"
@@ -156,6 +180,7 @@ def _check_size(content: bytes, name: str) -> None:
 
 
 def _is_large(content: bytes) -> bool:
+    """Return whether a file has too many values or too deep lists, by its events alone."""
     with contextlib.suppress(yaml.YAMLError, ValueError):  # explained by the parsers
         for _, depth, values in yaml_events(content):
             if values > MAX_VALUES or depth > MAX_DEPTH:
@@ -166,25 +191,29 @@ def _is_large(content: bytes) -> bool:
 # Composing is expensive, and a write reads each of its two texts several times
 @lru_cache(maxsize=8)
 def _composed(text: str, name: str, version: str) -> Any:
+    """Return the root of a file's tree, by the parser of a version of YAML: 1.2 or 1.1.
+
+    Raises:
+        ControllerUnfit: it is no YAML, or empty.
+    """
     # The parsers in Python refuse these tabs. As many blanks keep every place in the text; the text
     # itself keeps its tabs, and `locate` compares each number with it.
     text = _TABS.sub(lambda tabs: " " * len(tabs[0]), text)
+    root = None
+    fault = "nothing in it"
     try:
         if version == "1.2":
             root = YAML(typ="safe", pure=True).compose(text)
         else:
             root = yaml.compose(text, Loader=yaml.SafeLoader)
-        found = "nothing in it"
     except RecursionError:
-        root = None
-        found = "too many lists in lists"
+        fault = "too many lists in lists"
     except (YAMLError, yaml.YAMLError, ValueError) as error:
-        root = None
-        found = " ".join(str(error).split())[:200]
+        fault = " ".join(str(error).split())[:200]
     if root is None:
         raise ControllerUnfit(
             name,
-            found=f"no YAML {version} ({found})",
+            found=f"no YAML {version} ({fault})",
             expected="the controller's parameters, in one YAML document for readers of both YAML "
             "1.1 and 1.2",
             remedy="is this the right file? If it is, correct it; nothing was written",
@@ -192,25 +221,29 @@ def _composed(text: str, name: str, version: str) -> Any:
     return root
 
 
-def _count_references(node: Node, references: Counter[int]) -> None:
-    """Count from how many places each node is reached: more than once means an alias."""
-    references[id(node)] += 1
-    if references[id(node)] > 1:
-        return
-    if isinstance(node, MappingNode):
-        for name, value in node.value:
-            _count_references(name, references)
-            _count_references(value, references)
-    elif isinstance(node, SequenceNode):
-        for child in node.value:
-            _count_references(child, references)
+def _count_visits(root: Node) -> Counter[int]:
+    """Count from how many places each node is reached, by its id: more than one means an alias."""
+    visits = Counter[int]()
+    waiting = [root]
+    while waiting:
+        node = waiting.pop()
+        visits[id(node)] += 1
+        if visits[id(node)] > 1:
+            continue  # its children are counted
+        if isinstance(node, MappingNode):
+            for name, value in node.value:
+                waiting += [name, value]
+        elif isinstance(node, SequenceNode):
+            waiting += node.value
+    return visits
 
 
 def _values(root: Any) -> dict[KeyPath, str]:
     """Return every scalar of a tree by its path, and the size of every list and mapping.
 
     The two parsers have unrelated node classes whose parts have the same names. A node that an
-    alias repeats is followed once: it is the same text.
+    alias repeats is followed once: it is the same text. A key that is no scalar has its position
+    in the path.
     """
     values: dict[KeyPath, str] = {}
     seen: set[int] = set()

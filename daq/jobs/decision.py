@@ -20,7 +20,7 @@ from daq.ledger.ledger import record_session
 from daq.report.document import json_text
 from daq.report.job_schemas import FailedCheck, ProposalReport, ProposedGain
 from daq.writeback.gates.gate import Gate
-from daq.writeback.judgement import Spread, judge, known_of
+from daq.writeback.judgement import HistoryFigures, figures_of_history, judge
 from daq.writeback.request import Request
 from daq.writeback.target import Proposal, Written
 from ident.calibration import Calibration
@@ -60,7 +60,7 @@ def decide_outcome(
     proposal = _proposed(context, session, calibration, now)
     edit = proposal.edit
     decision = decision_of(
-        proposal, known_of(history, context.target.subject, digest, edit.changes)
+        proposal, figures_of_history(history, context.target.subject, digest, edit.changes)
     )
     differs = any(gain.differs for gain in decision.gains)
     if differs and touched:
@@ -183,7 +183,7 @@ def _apply(context: SessionContext, proposal: Proposal[Any], now: datetime) -> W
             return context.tools.apply(again, now, audit=audit, who=context.who)
 
 
-def decision_of(proposal: Proposal[Any], known: Spread) -> Decision:
+def decision_of(proposal: Proposal[Any], known: HistoryFigures) -> Decision:
     """Judge which gains differ significantly from the current ones (`daq.writeback.judgement`),
     each among all axes.
     """

@@ -51,9 +51,9 @@ class StoredHistory:
     @property
     def audit_digests(self) -> frozenset[str]:
         """SHA-256 of the entries that the audit log must have."""
-        digests: list[str | None] = [event.audit for event in self.events]
-        digests += [acknowledgement.audit for acknowledgement in self.acknowledgements]
-        return frozenset(digest for digest in digests if digest is not None)
+        of_acknowledgements = {acknowledgement.audit for acknowledgement in self.acknowledgements}
+        of_events = {event.audit for event in self.events if event.audit is not None}
+        return frozenset(of_acknowledgements | of_events)
 
 
 EMPTY = StoredHistory(calibrations=(), events=(), acknowledgements=(), flaws=())
@@ -77,7 +77,7 @@ def read_stored(path: Path) -> StoredHistory:
         HistoryInaccessible: it is locked for long, or its rights do not let it be read.
         HistoryUnreadable: it is none, of a later version, or broken.
     """
-    # Not "ro", which could not undo the unfinished transaction of a killed writer; "rw" opens a
+    # "rw" undoes the unfinished transaction of a killed writer, which "ro" cannot, and opens a
     # read-only file, too.
     quoted = quote(os.fsencode(path.absolute()))
     address = f"file:{quoted}?mode=rw"
@@ -261,15 +261,14 @@ def _calibration_drafts(
     """Yield entries for two kinds of calibrations: those of the audit log without figures, which an
     earlier version entered, and those that only the file has.
     """
-    known = {}
-    for calibration in entered_calibrations(entries, cell):
-        known[calibration.digest] = calibration
+    known_digests = set()
     without_figures = []
-    for calibration in known.values():
+    for calibration in entered_calibrations(entries, cell):
+        known_digests.add(calibration.digest)
         if calibration.figures is None and calibration.document is not None:
             without_figures.append(calibration)
-    lacking = [calibration for calibration in stored if calibration.digest not in known]
-    for calibration in (*without_figures, *lacking):
+    only_stored = [one for one in stored if one.digest not in known_digests]
+    for calibration in (*without_figures, *only_stored):
         try:
             figures = figures_of_document(calibration)
         except DaqError:
@@ -280,7 +279,7 @@ def _calibration_drafts(
             "entered": iso(calibration.entered),
             "figures": figures,
         }
-        if calibration.digest not in known:
+        if calibration.digest not in known_digests:
             details["document"] = calibration.document
         subject = history_subject(cell)
         yield EntryDraft(AuditAction.CALIBRATION_ENTERED, at, who, subject, details)
@@ -294,7 +293,9 @@ def history_subject(cell: str) -> str:
 def _event_drafts(
     stored: Iterable[Event], entries: Sequence[AuditEntry], cell: str
 ) -> Iterator[EntryDraft]:
-    """Yield entries for writes without an end in the audit log."""
+    """Yield entries for the writes of which the audit log has no end, and no earlier entry of
+    a migration.
+    """
     entry_by_digest = {entry.sha256: entry for entry in entries}
     known_writes = set()
     for entry in entries:
@@ -333,9 +334,9 @@ def _acknowledgement_drafts(
     # One that was migrated before has the digest of another entry, and is otherwise the same.
     known_content = {replace(acknowledgement, audit="") for acknowledgement in entered}
     for acknowledgement in stored:
-        if acknowledgement.audit in known_digests:
-            continue
-        if replace(acknowledgement, audit="") in known_content:
+        is_entered = acknowledgement.audit in known_digests
+        is_migrated = replace(acknowledgement, audit="") in known_content
+        if is_entered or is_migrated:
             continue
         details = {
             "axis": acknowledgement.axis,
@@ -355,6 +356,10 @@ def _acknowledgement_drafts(
 
 def set_aside(path: Path, at: datetime) -> Path:
     """Rename the file, with the journal of a killed writer; return its new name.
+
+    Args:
+        path: of the file.
+        at: time in UTC, which becomes part of the name.
 
     Raises:
         OSError: from the file system.

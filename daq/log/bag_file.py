@@ -1,13 +1,14 @@
-"""Open a file of a bag: MCAP or SQLite of ROS 2, or one of ROS 1; packed as a whole by zstd or not.
+"""Open a file of a bag: MCAP or SQLite of ROS 2, or one of ROS 1; each may be packed by zstd.
 
-The file may be truncated, damaged or malicious: what it unfolds to, or makes SQLite compute, is
-bounded by its size.
+The file may be truncated, damaged or malicious: its size bounds what it is unpacked to, and what
+it makes SQLite compute.
 """
 
 from __future__ import annotations
 
 import os
 import sqlite3
+from collections import Counter
 from collections.abc import Generator, Iterator
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
@@ -34,10 +35,11 @@ from daq.log.ros1_bag import ROS_1_MAGIC, Ros1Bag, more_behind
 from daq.log.table import kind_of_content
 
 SQLITE_MAGIC = b"SQLite format 3\0"
-#: Instructions of SQLite for any file, and STEPS_A_BYTE more for each byte; a message takes 20
+#: Instructions of SQLite for any file, and STEPS_A_BYTE more for each byte of it; reading a message
+#: takes 20
 STEPS = 10_000_000
 STEPS_A_BYTE = 2
-COUNTED_STEPS = 1000  #: Instructions between two counts
+STEPS_A_COUNT = 1000  #: Instructions after which SQLite calls `_count_steps`
 BYTES_A_TOPIC = 64  #: Least size of a topic in the file
 PIECE_BYTES = 2**20  #: Unpacked at a time
 
@@ -51,7 +53,7 @@ class SqliteBag:
         """Store the path and where the content is."""
         self.path = path
         self._source = source
-        self._steps_left = 0
+        self._counts_left = 0
         self._bytes_left = 0
 
     def messages(self) -> Generator[BagMessage, None, None]:
@@ -65,12 +67,12 @@ class SqliteBag:
         try:
             self._refuse_unfinished()
             with closing(sqlite3.connect(uri, uri=True)) as database:
-                self._bound(database)
+                self._set_bounds(database)
                 # Without this, SQLite would leave out the rows of broken pages without a word.
                 (found,) = database.execute("PRAGMA quick_check(1)").fetchone()
                 if found != "ok":
                     raise self._broken(str(self.path), str(found))
-                self._refuse_another_behind(database)
+                self._refuse_second_database(database)
                 yield from self._messages(database)
         except OSError as error:
             raise LogMissing(
@@ -86,20 +88,21 @@ class SqliteBag:
         """Make the error for a row of a table."""
         return self._broken(f"{self.path}, row {place}", found, expected)
 
-    def _bound(self, database: sqlite3.Connection) -> None:
-        """Bound time and memory: a table of the file may be computed,
-        and then has any number of rows of any size.
+    def _set_bounds(self, database: sqlite3.Connection) -> None:
+        """Bound time and memory: a table of the file may be a view or have computed columns,
+        and so any number of rows of any size.
         """
         with open_regular(self._source) as stream:
             size = os.fstat(stream.fileno()).st_size
         self._bytes_left = size
-        self._steps_left = (STEPS + STEPS_A_BYTE * size) // COUNTED_STEPS
+        steps = STEPS + STEPS_A_BYTE * size
+        self._counts_left = steps // STEPS_A_COUNT
         database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, LARGEST_RECORD)
-        database.set_progress_handler(self._count_steps, COUNTED_STEPS)
+        database.set_progress_handler(self._count_steps, STEPS_A_COUNT)
         database.execute("PRAGMA trusted_schema = OFF")
 
-    def _refuse_another_behind(self, database: sqlite3.Connection) -> None:
-        """Refuse a second database behind the pages of the first, which SQLite does not look at."""
+    def _refuse_second_database(self, database: sqlite3.Connection) -> None:
+        """Refuse a second database behind the pages of the first: SQLite would not read it."""
         (pages,) = database.execute("PRAGMA page_count").fetchone()
         (page_bytes,) = database.execute("PRAGMA page_size").fetchone()
         end = pages * page_bytes
@@ -111,42 +114,48 @@ class SqliteBag:
             raise more_behind(self.path, end, size, is_bag=True)
 
     def _count_steps(self) -> bool:
-        """Count; SQLite stops at True."""
-        self._steps_left -= 1
-        return self._steps_left < 0
+        """Count STEPS_A_COUNT instructions more; SQLite stops where this returns True."""
+        self._counts_left -= 1
+        return self._counts_left < 0
 
     def _messages(self, database: sqlite3.Connection) -> Iterator[BagMessage]:
-        topics: dict[int, Topic] = {}
-        for row, name, schema, encoding in database.execute(
-            "SELECT id, name, type, serialization_format FROM topics"
-        ):
-            self._spend(row, BYTES_A_TOPIC + len(str(name)))
-            has_joint_states = schema == JOINTS_SCHEMA and encoding == "cdr"
-            others = [topic for topic in topics.values() if topic.name == str(name)]
-            topics[row] = Topic(str(name), has_joint_states, channel=len(others) + 1)
-        for row, number, time_ns, data in database.execute(
-            "SELECT id, topic_id, timestamp, data FROM messages"
-        ):
-            topic = topics.get(number)
+        topics = self._topics(database)
+        query = "SELECT id, topic_id, timestamp, data FROM messages"
+        for row, topic_id, time_ns, data in database.execute(query):
+            topic = topics.get(topic_id)
             if topic is None or not isinstance(time_ns, int) or not isinstance(data, bytes):
-                raise self.corrupt(
-                    row, f"topic {number}, time {time_ns!r:.40}", "a topic, nanoseconds and bytes"
-                )
-            self._spend(row, len(data))
+                found = f"topic {topic_id}, time {time_ns!r:.40}"
+                raise self.corrupt(row, found, "a topic, nanoseconds and bytes")
+            self._count_bytes(row, len(data))
             yield BagMessage(row, topic, time_ns, data)
 
-    def _spend(self, row: int, size: int) -> None:
-        """Count what is read; a table that is computed may have more of it than the file."""
+    def _topics(self, database: sqlite3.Connection) -> dict[int, Topic]:
+        """Return the topics by their id."""
+        topics: dict[int, Topic] = {}
+        # Counted, not searched for among the topics before: a file may have very many.
+        channels = Counter[str]()
+        query = "SELECT id, name, type, serialization_format FROM topics"
+        for topic_id, stored_name, schema, encoding in database.execute(query):
+            name = str(stored_name)
+            self._count_bytes(topic_id, BYTES_A_TOPIC + len(name))
+            has_joint_states = schema == JOINTS_SCHEMA and encoding == "cdr"
+            channels[name] += 1
+            topics[topic_id] = Topic(name, has_joint_states, channel=channels[name])
+        return topics
+
+    def _count_bytes(self, row: int, size: int) -> None:
+        """Count the bytes of a row; refuse more than the file has, as a computed table may give."""
         self._bytes_left -= size
         if self._bytes_left < 0:
             raise self.corrupt(row, "more bytes than the file has", "a recording")
 
     def _refuse_unfinished(self) -> None:
-        """Refuse a file next to which SQLite has left what belongs into it:
-        it would be read without that.
+        """Refuse a file next to which SQLite has left its log or journal:
+        the file would be read without what is in there.
         """
         name = self.path.name
-        for rest in (self.path.with_name(f"{name}-wal"), self.path.with_name(f"{name}-journal")):
+        for suffix in ("-wal", "-journal"):
+            rest = self.path.with_name(f"{name}{suffix}")
             if rest.exists() and rest.stat().st_size > 0:
                 raise LogTruncated(
                     str(self.path),
@@ -168,13 +177,17 @@ class SqliteBag:
 
 @contextmanager
 def open_bag(path: Path) -> Iterator[McapBag | SqliteBag | Ros1Bag]:
-    """Open a file of a bag, by its content;
-    a file that cannot be read is reported with its messages.
+    """Open a file of a bag as the kind that its first bytes show.
+
+    Damage behind these bytes is reported with the messages.
 
     Raises:
-        LogCorrupt: it is empty; or it is packed, and unfolds to nothing, or to more than a
-            recording.
-        OutputFailed: there is no room for what it unfolds to.
+        LogMissing: it cannot be opened, or a packed one cannot be read.
+        LogTruncated: it ends within the first bytes of a bag.
+        LogForeign: it is of another kind.
+        LogCorrupt: it is empty; or it is packed, and the content is damaged, empty, or larger than
+            that of a recording.
+        OutputFailed: there is no room for the unpacked content.
     """
     if path.is_file() and path.stat().st_size == 0:
         raise LogCorrupt(
@@ -190,11 +203,12 @@ def open_bag(path: Path) -> Iterator[McapBag | SqliteBag | Ros1Bag]:
         source = Path(folder) / "bag"
         _unpack_file(path, source)
         if source.stat().st_size == 0:
-            raise _packed_wrong(path, "a file that unfolds to nothing: it was cut")
+            raise _not_unpacked(path, "a file that unfolds to nothing: it was cut")
         yield _bag(path, source)
 
 
 def _bag(path: Path, source: Path) -> McapBag | SqliteBag | Ros1Bag:
+    """Return the bag with the content of `source`; messages name `path`."""
     head = first_bytes(source)
     if head.startswith(SQLITE_MAGIC):
         return SqliteBag(path, source)
@@ -238,8 +252,8 @@ def _refuse_other_kind(path: Path, source: Path, head: bytes) -> None:
 
 
 def first_bytes(path: Path) -> bytes:
-    """Return the first bytes of a file, by which its kind is known; none if it cannot be read: its
-    reader reports that.
+    """Return the first bytes of a file, by which its kind is known; none if it cannot be read:
+    whoever opens it then reports that.
     """
     with suppress(OSError), open_regular(path) as stream:
         return stream.read(HEAD_BYTES)
@@ -247,30 +261,50 @@ def first_bytes(path: Path) -> bytes:
 
 
 def _unpack_file(path: Path, target: Path) -> None:
-    with open_regular(path) as packed:
-        left = LARGEST_CHUNK + LARGEST_RATIO * os.fstat(packed.fileno()).st_size
-        reader = zstandard.ZstdDecompressor().stream_reader(packed, read_across_frames=True)
-        try:
-            with target.open("wb") as stream:
-                while piece := reader.read(PIECE_BYTES):
-                    left -= len(piece)
-                    if left < 0:
-                        raise _packed_wrong(
-                            path, f"a file that unfolds to {LARGEST_RATIO} times its size"
-                        )
-                    stream.write(piece)
-        except zstandard.ZstdError as error:
-            raise _packed_wrong(path, str(error)) from error
-        except OSError as error:
-            raise OutputFailed(
-                str(target),
-                found=reason_of(error),
-                expected=f"room for what {path.name} unfolds to",
-                remedy="free space, or name another folder in the environment variable TMPDIR",
-            ) from error
+    """Unpack a file; see `open_bag` for the errors."""
+    try:
+        with target.open("wb") as stream:
+            for piece in _unpacked_pieces(path):
+                stream.write(piece)
+    except OSError as error:
+        raise OutputFailed(
+            str(target),
+            found=reason_of(error),
+            expected=f"room for what {path.name} unfolds to",
+            remedy="free space, or name another folder in the environment variable TMPDIR",
+        ) from error
 
 
-def _packed_wrong(path: Path, found: str) -> LogCorrupt:
+def _unpacked_pieces(path: Path) -> Iterator[bytes]:
+    """Yield the unpacked content of a file.
+
+    Raises:
+        LogMissing: it cannot be read.
+        LogCorrupt: it is damaged, or its content is larger than that of a recording.
+    """
+    try:
+        with open_regular(path) as packed:
+            packed_bytes = os.fstat(packed.fileno()).st_size
+            bytes_left = LARGEST_CHUNK + LARGEST_RATIO * packed_bytes
+            reader = zstandard.ZstdDecompressor().stream_reader(packed, read_across_frames=True)
+            while piece := reader.read(PIECE_BYTES):
+                bytes_left -= len(piece)
+                if bytes_left < 0:
+                    found = f"a file that unfolds to {LARGEST_RATIO} times its size"
+                    raise _not_unpacked(path, found)
+                yield piece
+    except zstandard.ZstdError as error:
+        raise _not_unpacked(path, str(error)) from error
+    except OSError as error:
+        raise LogMissing(
+            str(path),
+            found=reason_of(error),
+            expected="a recording, packed by zstd",
+            remedy="copy it again from where it was recorded",
+        ) from error
+
+
+def _not_unpacked(path: Path, found: str) -> LogCorrupt:
     return LogCorrupt(
         str(path),
         found=found,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import fcntl
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import chain
@@ -30,7 +30,7 @@ _HARMLESS = (
     EventKind.CAPTURE,
     EventKind.STOP,
 )
-"""Events of sound runs; after any other a recorder might have marked the run invalid."""
+"""Events that a valid run may have; after any other a recorder might have marked it invalid."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +56,8 @@ def salvage(
         progress: called with the number of samples so far.
 
     Raises:
-        UsageError: the recorder still writes the file, or the file is whole.
+        UsageError: the recorder still writes the file, the file is whole, or `out` is the name
+            that the whole recording would have.
         UsageError, OutputFailed: the log cannot be written.
         LogUnreadable: not even one sample, or not the start of the log, can be saved.
         ConfigurationError: the cell configuration in it is inconsistent.
@@ -79,10 +80,11 @@ def salvage(
             )
     reader = LogReader(damaged)
     blocks = reader.until_damage()
-    first = next(blocks, None)
-    if first is None and isinstance(reader.damage, LogTruncated):
-        raise _nothing_saved(damaged, f"{reader.damage.found}, and no samples") from reader.damage
-    if first is None:
+    first_block = next(blocks, None)
+    if first_block is None:
+        if isinstance(reader.damage, LogTruncated):
+            found = f"{reader.damage.found}, and no samples"
+            raise _nothing_saved(damaged, found) from reader.damage
         raise reader.damage or _nothing_saved(damaged, "no samples")
     head = reader.head
     cell = head.cell(damaged)
@@ -90,19 +92,23 @@ def salvage(
     origin = f"{head.run.origin}; salvaged from {damaged.name}"
     run = replace(head.run, origin=origin)
     content = LogContent.of(cell, run, head.files, head.readback)
-    # A crash loses only this new file, so no clock is needed to flush in time.
+    # A crash loses only this new file, which can be made again: it needs no flushes by a clock.
     with LogWriter(
         out, content, scale.joint_position_of, clock_ns=lambda: 0, keeps_part=False
     ) as log:
-        _copy(reader, chain((first,), blocks), log, cell, progress)
-    size = damaged.stat().st_size
+        _copy(reader, chain((first_block,), blocks), log, cell, progress)
     damage = ""
-    bytes_left_out = 0
+    left_out_bytes = 0
     if reader.damage is not None:
         damage = f"{reader.damage.subject}: {reader.damage.found}"
-        bytes_left_out = size - reader.whole_bytes
-    duration_s = log.statistics.samples / run.rate_hz
-    return Salvaged(out, log.statistics, duration_s, bytes_left_out, damage)
+        left_out_bytes = damaged.stat().st_size - reader.whole_bytes
+    return Salvaged(
+        log=out,
+        statistics=log.statistics,
+        duration_s=log.statistics.samples / run.rate_hz,
+        left_out_bytes=left_out_bytes,
+        damage=damage,
+    )
 
 
 def _copy(
@@ -112,46 +118,67 @@ def _copy(
     cell: Cell,
     progress: Callable[[int], None],
 ) -> None:
-    known_events = 0
-    known_readings = 0
+    """Copy samples, events and slow readings to the new log, and conclude it with a verdict.
+
+    Raises:
+        LogIncomplete: samples or readings are of another number of axes than the cell.
+    """
+    copied_events = 0
+    copied_readings = 0
     axes = len(cell.axes)
     watch = MotionWatch(cell, reader.head)
     for block in chain(blocks, (None,)):  # events and readings may follow the last samples
-        for event in reader.events[known_events:]:
+        for event in reader.events[copied_events:]:
             log.event(event)
-        known_events = len(reader.events)
-        fresh = reader.readings[known_readings:]
-        foreign = {reading.axis for reading in fresh if reading.axis >= axes}
-        if foreign:
-            surplus = f"a torque or temperature of axis {max(foreign)}, counted from 0"
-            raise _foreign(reader.path, surplus, f"those of {axes} axes")
-        log.readings(fresh)
-        known_readings = len(reader.readings)
+        copied_events = len(reader.events)
+        new_readings = reader.readings[copied_readings:]
+        foreign_axes = {reading.axis for reading in new_readings if reading.axis >= axes}
+        if foreign_axes:
+            found = f"a torque or temperature of axis {max(foreign_axes)}, counted from 0"
+            raise _foreign(reader.path, found, f"those of {axes} axes")
+        log.readings(new_readings)
+        copied_readings = len(reader.readings)
         if block is None:
             break
         width = block.position_counts.shape[1]
         if width != axes:
             raise _foreign(reader.path, f"samples of {width} axes", f"{axes}")
         watch.take(block)
-        columns = (getattr(block, name).tolist() for name in SampleBlock.__slots__)
-        for cycle, time_ns, position, current, statusword, missing in zip(*columns, strict=True):
-            sample = Sample(
-                cycle=cycle,
-                time_ns=time_ns,
-                position_counts=tuple(position),
-                current_raw=tuple(current),
-                statusword=tuple(statusword),
-                missing=missing,
-            )
+        for sample in _samples(block):
             log.write(sample)
         progress(log.statistics.samples)
     if reader.concluded:
         faults = _faults_of_recorder(reader)
     else:
         faults = _faults_of_samples(reader, log.statistics)
+    # The watch wants the recorder's verdict alone of these statistics.
     judged = RunStatistics(0, 0, (), valid=not faults, reason=", ".join(faults))
-    verdict = watch.verdict(reader.checks, judged, lambda: LogReader(reader.path).until_damage())
-    log.conclude(*verdict, partial=True)
+    valid, reason = watch.verdict(
+        reader.checks, judged, lambda: LogReader(reader.path).until_damage()
+    )
+    log.conclude(valid, reason, partial=True)
+
+
+def _samples(block: SampleBlock) -> Iterator[Sample]:
+    """Yield the samples of a block, with numbers of Python."""
+    columns = zip(
+        block.cycle.tolist(),
+        block.time_ns.tolist(),
+        block.position_counts.tolist(),
+        block.current_raw.tolist(),
+        block.statusword.tolist(),
+        block.missing.tolist(),
+        strict=True,
+    )
+    for cycle, time_ns, position_counts, current_raw, statusword, missing in columns:
+        yield Sample(
+            cycle=cycle,
+            time_ns=time_ns,
+            position_counts=tuple(position_counts),
+            current_raw=tuple(current_raw),
+            statusword=tuple(statusword),
+            missing=missing,
+        )
 
 
 def _faults_of_recorder(reader: LogReader) -> list[str]:
@@ -188,7 +215,12 @@ def _foreign(path: Path, found: str, expected: str) -> LogIncomplete:
 
 
 def _refuse_running(damaged: Path) -> None:
-    with suppress(OSError), open_regular(damaged) as stream:  # also of a file system without locks
+    """Refuse a file that its recorder still has locked; a file system may have no locks.
+
+    Raises:
+        UsageError: it is locked.
+    """
+    with suppress(OSError), open_regular(damaged) as stream:
         try:
             fcntl.flock(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
         except BlockingIOError as error:

@@ -30,7 +30,7 @@ from daq.report.gains import encoder_text, mass_texts
 from daq.report.proposal import Refused
 from daq.report.text import minute_text
 from daq.writeback.gates.gate import Gate, Refusal
-from daq.writeback.judgement import NOT_JUDGED, JudgedChange, Spread, judge, noise_note
+from daq.writeback.judgement import NOT_JUDGED, HistoryFigures, JudgedChange, judge, noise_note
 from daq.writeback.request import GainChange, GainOrigin
 from ident.calibration import Calibration, EncoderMisfit, PayloadMass
 from ident.data.run import Recording
@@ -396,7 +396,7 @@ def certify(
         _require_same(calibration, earlier)
         gains = {gain.axis: gain.value for gain in earlier.gains}
         changes = changes_from(gains, GainOrigin.EARLIER, calibration)
-        known = Spread({gain.axis: gain.std for gain in earlier.gains})
+        known = HistoryFigures({gain.axis: gain.std for gain in earlier.gains})
         with_earlier = replace(comparison, changes=changes, refusals=(), known=known)
         rows_since_earlier = _rows(with_earlier)
     origin = origin or Origin.of(calibration)

@@ -25,7 +25,12 @@ from daq.ledger.ledger import Ledger, Standing, read_standing
 from daq.writeback.file_target import FileEdit, FileTarget
 from daq.writeback.gates.gate import Gate, GateContext, Refusal
 from daq.writeback.gates.table import check_gates
-from daq.writeback.judgement import NOTHING, Spread, known_of, query_history
+from daq.writeback.judgement import (
+    NO_HISTORY,
+    HistoryFigures,
+    figures_of_history,
+    read_history_figures,
+)
 from daq.writeback.request import Edit, GainChange, GainOrigin, Request
 from daq.writeback.target import propose
 from ident.calibration import Calibration
@@ -49,7 +54,7 @@ class Comparison:
     changes: tuple[GainChange, ...]  #: one an axis
     refusals: tuple[Refusal, ...]  #: failed checks
     policy: ApplyPolicy  #: limits
-    known: Spread = NOTHING  #: σ of the current gains, by the history
+    known: HistoryFigures = NO_HISTORY  #: σ of the current gains, by the history
     #: planned change of the controller's file; None where it was not read
     edit: FileEdit | None = None
     unread: str = ""  #: why it was not read
@@ -181,7 +186,7 @@ def compare(
             without_controller(request.calibration, unread, request.now, cell), standing=standing
         )
     edit = proposal.edit
-    known = query_history(cell, edit.subject, request, edit.changes, audit)
+    known = read_history_figures(cell, edit.subject, request, edit.changes, audit)
     return Comparison(
         changes=edit.changes,
         refusals=proposal.refusals,
@@ -228,5 +233,5 @@ def before_write(comparison: Comparison, digest: str) -> Comparison | None:
     changes = tuple(compared)
     # The previous gains were those of another calibration: none is in force for them.
     others = replace(standing.history, events=())
-    known = known_of(others, "", digest, changes)
+    known = figures_of_history(others, "", digest, changes)
     return replace(comparison, changes=changes, refusals=(), known=known)

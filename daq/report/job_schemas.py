@@ -113,7 +113,8 @@ class ConcludedJob(RefusedJob):
 class JobReport(JobState, ConcludedJob):
     """`recalibrate`: what is left to do, and the state of its session."""
 
-    # Keys of the base that is named last come first.
+    # The keys of the last base come first. Both bases have these two: their types are those of a
+    # job that has ended.
     outcome: Outcome
     exit_code: int
 

@@ -195,15 +195,13 @@ def record_report(path: Path, recorded: Recorded, cell: Cell) -> RecordReport:
     """Return a finished recording: the log with its losses, warnings about the currents,
     and the load of the buses.
     """
-    return RecordReport.of(
-        recorded.log,
-        recorded,
-        log=path,
-        bus_load=[
-            BusLoadEntry(bus=bus.name, mean_percent=100 * load.mean, worst_percent=100 * load.worst)
-            for bus, load in bus_loads(cell)
-        ],
-    )
+    loads = []
+    for bus, load in bus_loads(cell):
+        entry = BusLoadEntry(
+            bus=bus.name, mean_percent=100 * load.mean, worst_percent=100 * load.worst
+        )
+        loads.append(entry)
+    return RecordReport.of(recorded.log, recorded, log=path, bus_load=loads)
 
 
 def import_report(path: Path, imported: Imported, holdout: Path | None = None) -> ImportReport:
@@ -279,11 +277,11 @@ def info_report(path: Path) -> InfoReport:
 
 
 def _recorded_currents(run: RunInfo, cell: Cell) -> dict[str, str]:
-    """What each axis' current is: an object of its drive, or a column of an imported file."""
+    """Return what the current of each axis is: an object of its drive, or a column of a file."""
     currents = current_signals(cell)
     if run.origin.startswith(RECORDED):
         return currents
-    # The objects that its cell file names are those of a recording.
+    # Its cell file names objects of drives, but no drive was read for an import.
     return dict.fromkeys(currents, "a column of the imported file")
 
 
@@ -301,11 +299,11 @@ def timing_text(timing: Timing) -> str:
         (timing.close, "too close to the one before and dropped"),
     )
     parts += [f"{count} {text}" for count, text in counts if count]
-    how = "uniform at"
+    clock = "uniform at"
     if timing.resampled:
-        how = "resampled to"
+        clock = "resampled to"
     # Seven digits: a rate of 1 MHz would be written with an exponent otherwise.
-    return f"{how} {timing.rate_hz:.7g} Hz: {', '.join(parts)}"
+    return f"{clock} {timing.rate_hz:.7g} Hz: {', '.join(parts)}"
 
 
 FOR_PROGRAMS = frozenset({"wall_minus_monotonic_s"})
@@ -315,12 +313,14 @@ of which `wall_clock_step_s` has the change.
 
 
 def log_lines(description: Mapping[str, Any], width: int) -> Iterator[Text]:
-    """Lines of a log's description, at most `width` columns wide where words allow it."""
+    """Yield the lines of a log's description, at most `width` columns wide where words allow it."""
     shown = {key: value for key, value in description.items() if key not in FOR_PROGRAMS}
     indent = max(map(len, shown)) + 2
     for key, value in shown.items():
+        name = key.replace("_", " ")
         text = printable(_readable(value)).replace("\n", " ")
-        yield from map(Text, entry_lines(key.replace("_", " "), text, indent, width))
+        for line in entry_lines(name, text, indent, width):
+            yield Text(line)
 
 
 def _yes_or_no(value: bool) -> str:
@@ -344,7 +344,8 @@ def _readable(value: Any) -> str:
 
 
 def _readable_float(value: float) -> str:
-    # An exponent is for programs: 1234567.8 s is 1234568, not 1.23457e+06.
+    # People read large numbers better without an exponent: 1234567.8 s is 1234568, not
+    # 1.23457e+06.
     rounded = f"{value:.0f}"
     if len(rounded) > 6 and abs(value) < 1e15:
         return rounded

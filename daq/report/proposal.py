@@ -17,7 +17,7 @@ from daq.report.gains import with_deviation
 from daq.report.text import plain_table, terminal_lines, terminal_text
 from daq.writeback.drive_target import DriveEdit
 from daq.writeback.file_target import FileEdit
-from daq.writeback.judgement import NOT_JUDGED, NOTHING, Spread, judge, noise_note
+from daq.writeback.judgement import NO_HISTORY, NOT_JUDGED, HistoryFigures, judge, noise_note
 from daq.writeback.request import Edit, GainChange, GainOrigin
 from daq.writeback.target import E, Proposal, Written
 
@@ -121,7 +121,9 @@ class DriveRollback(Report):
     saved: bool = False
 
 
-def show_proposal(proposal: Proposal[E], console: Console, known: Spread = NOTHING) -> None:
+def show_proposal(
+    proposal: Proposal[E], console: Console, known: HistoryFigures = NO_HISTORY
+) -> None:
     """Print the change as a table and as a diff, judged by the history."""
     edit = proposal.edit
     console.print(change_table(edit.changes, known))
@@ -139,7 +141,7 @@ def show_proposal(proposal: Proposal[E], console: Console, known: Spread = NOTHI
         _show_diff(terminal_lines(edit.diff), console)
 
 
-def change_table(changes: tuple[GainChange, ...], known: Spread = NOTHING) -> Table:
+def change_table(changes: tuple[GainChange, ...], known: HistoryFigures = NO_HISTORY) -> Table:
     """Make the table of current and new gains, with the figures to judge a change by."""
     current = GainOrigin.CURRENT.value
     headings = (
@@ -175,7 +177,7 @@ def change_table(changes: tuple[GainChange, ...], known: Spread = NOTHING) -> Ta
 
 
 def proposal_report(
-    proposal: Proposal[E], written: Written | None, known: Spread
+    proposal: Proposal[E], written: Written | None, known: HistoryFigures
 ) -> FileChange | DriveChange:
     """Return a proposal and its outcome; `written` is None where nothing was written."""
     edit = proposal.edit

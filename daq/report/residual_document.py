@@ -251,7 +251,7 @@ _METRIC = (
 
 
 def residual_report(fitted: Fit, account: Account, calibration: Calibration) -> ResidualReport:
-    """Return the closed loop: the calibration, the errors before and after,
+    """Return the document of a search for effects: the calibration, the errors before and after,
     and every turn of the search.
     """
     axes = fitted.cell.axis_names
@@ -293,9 +293,9 @@ def residual_report(fitted: Fit, account: Account, calibration: Calibration) -> 
 
 
 def _noise_floor(account: Account, axes: tuple[str, ...]) -> NoiseFloor:
-    floors = zip(axes, account.floors, account.left_a.tolist(), strict=True)
+    left_by_axis_a = account.left_a.tolist()
     motors = []
-    for axis, floor, left_a in floors:
+    for axis, floor, left_a in zip(axes, account.floors, left_by_axis_a, strict=True):
         noise = None
         if floor is not None:
             noise = _motor_noise(axis, floor, left_a)
@@ -311,13 +311,22 @@ def _noise_floor(account: Account, axes: tuple[str, ...]) -> NoiseFloor:
 
 
 def _motor_noise(axis: str, floor: MotorNoiseFloor, left_a: float) -> MotorNoise:
+    least_a = None
+    if floor.is_bound:
+        least_a = floor.least_a
+    dwells = None
+    pairs = None
+    if floor.source is FloorSource.STANDSTILL:
+        dwells = floor.parts
+    elif floor.source is FloorSource.REPEATED_MOVES:
+        pairs = floor.parts
     return MotorNoise.of(
         floor,
         axis=axis,
         noise=floor.noise_a,
-        least=floor.least_a if floor.is_bound else None,
-        dwells=floor.parts if floor.source is FloorSource.STANDSTILL else None,
-        pairs=floor.parts if floor.source is FloorSource.REPEATED_MOVES else None,
+        least=least_a,
+        dwells=dwells,
+        pairs=pairs,
         degrees_of_freedom=floor.freedom,
         left=left_a,
         refuted=floor.is_refuted(left_a),
@@ -325,48 +334,55 @@ def _motor_noise(axis: str, floor: MotorNoiseFloor, left_a: float) -> MotorNoise
 
 
 def _turn(fitted: Fit, step: Step, turn: BeforeAfter | None) -> TurnEntry:
-    axes = fitted.cell.place_names
-    limits = zip(fitted.cell.axes, step.limits_nm, strict=True)
+    """Return one turn of the search; `turn` is None where it changed nothing."""
+    places = fitted.cell.place_names
+    # Without a change, `TurnEntry.of` makes the other keys of a change null.
     changes: dict[str, Any] = {"added": [], "removed": []}
     if turn is not None:
         added = []
         for placed in turn.added:
-            sizes = coefficients(step.after, placed)
-            added.append(_named(PlacedEffectEntry, placed, axes, coefficients=sizes))
+            fitted_coefficients = coefficients(step.after, placed)
+            added.append(
+                _named(PlacedEffectEntry, placed, places, coefficients=fitted_coefficients)
+            )
         changes = {
             "added": added,
-            "removed": [placed.name_among(axes) for placed in turn.removed],
+            "removed": [placed.name_among(places) for placed in turn.removed],
             "before": _model_errors(turn.before),
             "after": _model_errors(turn.after),
             "gain_changes": _changed_gains(fitted, turn),
         }
     accepted = None
     if step.accepted is not None:
-        accepted = _finding(step.accepted, axes)
-    names = names_by_split(step)
-    split_names = [_named(SplitNameEntry, name.placed, axes, splits=name.splits) for name in names]
+        accepted = _finding(step.accepted, places)
+    split_names = []
+    for name in names_by_split(step):
+        split_names.append(_named(SplitNameEntry, name.placed, places, splits=name.splits))
     set_aside = []
     for rejected in step.set_aside:
-        finding = _finding(rejected.finding, axes)
-        set_aside.append(AsideEntry.of(finding, reason=rejected.reason(axes)))
-    detection_limits = [
-        DetectionLimit.of(axis=axis.name, rms=limit, unit=axis.unit.force) for axis, limit in limits
-    ]
+        finding = _finding(rejected.finding, places)
+        set_aside.append(AsideEntry.of(finding, reason=rejected.reason(places)))
+    detection_limits = []
+    for axis, limit_nm in zip(fitted.cell.axes, step.limits_nm, strict=True):
+        limit = DetectionLimit.of(axis=axis.name, rms=limit_nm, unit=axis.unit.force)
+        detection_limits.append(limit)
     return TurnEntry.of(
         None,
         **changes,
         accepted=accepted,
         names_by_split=split_names,
-        findings=[_finding(finding, axes) for finding in step.findings],
-        structures=[_finding(finding, axes) for finding in step.structures],
+        findings=[_finding(finding, places) for finding in step.findings],
+        structures=[_finding(finding, places) for finding in step.structures],
         set_aside=set_aside,
         detection_limits=detection_limits,
     )
 
 
 def _changed_gains(fitted: Fit, compared: BeforeAfter) -> list[ChangedGain]:
-    changes = zip(fitted.cell.axes, compared.gains, strict=True)
-    return [ChangedGain.of(change, axis=axis.name, unit=axis.gain_unit) for axis, change in changes]
+    changed = []
+    for axis, change in zip(fitted.cell.axes, compared.gains, strict=True):
+        changed.append(ChangedGain.of(change, axis=axis.name, unit=axis.gain_unit))
+    return changed
 
 
 def _model_errors(errors: RelativeErrors) -> ModelErrors:
@@ -386,24 +402,35 @@ def _model_errors(errors: RelativeErrors) -> ModelErrors:
 
 
 def _named(
-    kind: type[NamedT], placed: PlacedEffect, axes: tuple[str, ...], *sources: object, **others: Any
+    kind: type[NamedT],
+    placed: PlacedEffect,
+    places: tuple[str, ...],
+    *sources: object,
+    **others: Any,
 ) -> NamedT:
-    """Return what a document says of an effect, with its name, axis and settings."""
+    """Return a part of the document about an effect, with its name, axis and settings.
+
+    Args:
+        kind: type of the part.
+        placed: the effect.
+        places: names of the cell's axes, passive joints and pivots.
+        sources, others: as in `Report.of`.
+    """
     settings = {name: float(value) for name, value in placed.effect.settings.items()}
     return kind.of(
         *sources,
         effect=placed.effect.name,
-        axis=placed.axis_name(axes),
+        axis=placed.axis_name(places),
         settings=settings,
         **others,
     )
 
 
-def _verdict(verdict: EffectVerdict, axes: tuple[str, ...]) -> VerdictEntry:
+def _verdict(verdict: EffectVerdict, places: tuple[str, ...]) -> VerdictEntry:
     return _named(
         VerdictEntry,
         verdict.placed,
-        axes,
+        places,
         verdict,
         blocks=verdict.change.total.blocks,
         error_before_percent=verdict.before,
@@ -411,22 +438,25 @@ def _verdict(verdict: EffectVerdict, axes: tuple[str, ...]) -> VerdictEntry:
     )
 
 
-def _finding(finding: Finding, axes: tuple[str, ...]) -> FindingEntry:
-    sizes = zip(finding.effect.coefficients, finding.coefficients, finding.deviations, strict=True)
-    found = []
-    for column, value, std in sizes:
-        found.append(Coefficient.of(name=column.name, value=value, std=std, unit=column.unit))
-    # For findings that failed a gate it would be most of the file and of no use.
+def _finding(finding: Finding, places: tuple[str, ...]) -> FindingEntry:
+    estimated = zip(
+        finding.effect.coefficients, finding.coefficients, finding.deviations, strict=True
+    )
+    entries = []
+    for declared, value, std in estimated:
+        entry = Coefficient.of(name=declared.name, value=value, std=std, unit=declared.unit)
+        entries.append(entry)
+    # The ambiguity of findings that failed a gate would be most of the file, and of no use.
     ambiguity = None
     if finding.passed:
-        ambiguity = [rival.name_among(axes) for rival in finding.ambiguity]
+        ambiguity = [rival.name_among(places) for rival in finding.ambiguity]
     return _named(
         FindingEntry,
         finding.placed,
-        axes,
+        places,
         finding,
         variable=finding.effect.abscissa,
-        coefficients=found,
+        coefficients=entries,
         held_out_fall=finding.left_out_fall,
         ambiguity=ambiguity,
     )

@@ -94,7 +94,7 @@ def urdf_view(
         same_configuration: whether the cell file is that of the fit; None without a cell file.
         missing: effects of the calibration that are not installed.
     """
-    parameters = choice.robot.parameters
+    model = choice.model
     table = plain_table(
         ("joint", "link", "mass kg", "centre of mass m", "damping", "friction"), left=(0, 1)
     )
@@ -115,17 +115,17 @@ def urdf_view(
             f"Merged into the moving link that carries them: {', '.join(updated.merged)}."
         )
     left_out = ["rotor inertias", "offsets"]
-    if parameters.model.drive_train.coupled:
+    if model.drive_train.coupled:
         left_out.append("friction of coupled motors")
     corrected: list[str] = []
     for effect in calibration.effects:
         name = f"{effect.name} on {effect.axis}"
         if effect.name not in CORRECTIONS:
             left_out.append(name)
-        elif any(one.value != 0.0 for one in effect.coefficients):
+        elif any(coefficient.value != 0.0 for coefficient in effect.coefficients):
             corrected.append(name)
     left_out += missing
-    left_out += [f"closure {closure.name}" for closure in parameters.model.robot.closures]
+    left_out += [f"closure {closure.name}" for closure in model.robot.closures]
     yield printable(f"A URDF cannot hold: {', '.join(left_out)} (see --json).")
     if corrected:
         text = (
@@ -142,14 +142,15 @@ def urdf_view(
 
 
 def _choice_lines(choice: FullChoice) -> Iterator[RenderableType]:
-    """Say where the bodies come from, and how far their torque is from the identified one."""
-    robot = choice.robot
-    if robot.parameters.exact:
+    """Say how far the torque of the bodies is from the identified one, where they come from,
+    and what rests on the prior or was assumed.
+    """
+    if choice.exact:
         yield "The torque of these bodies is exactly the identified one."
     else:
-        change = robot.parameters.torque_change_percent
+        change = choice.torque_change_percent
         axes = ", ".join(f"{value:.2f}" for value in change.axes)
-        shown = robot.shifts[:_SHOWN_SHIFTS]
+        shown = choice.robot.shifts[:_SHOWN_SHIFTS]
         shifts = ", ".join(f"{shift.name} by {shift.deviations:.1f} σ" for shift in shown)
         if choice.chosen_by is ChosenBy.NEAREST_BODIES:
             subject = (
@@ -188,24 +189,24 @@ def urdf_report(
         calibration, choice, updates, updated, same_configuration, missing: as in `urdf_view`.
         out: the URDF.
     """
-    robot = choice.robot
-    parameters = robot.parameters
-    shifts = [
-        ShiftedParameter.of(shift, physical=shift.realised, standard_deviations=shift.deviations)
-        for shift in robot.shifts
-    ]
+    shifts = []
+    for shift in choice.robot.shifts:
+        shifted = ShiftedParameter.of(
+            shift, physical=shift.realised, standard_deviations=shift.deviations
+        )
+        shifts.append(shifted)
     joints = []
-    for number, update in enumerate(updates.values()):
-        joints.append(_joint(choice, number, update, updated))
-    columns = zip(parameters.model.columns, parameters.standard, strict=True)
-    not_in_urdf = [
-        NotInUrdf.of(column, value=value) for column, value in columns if _is_of_motor(column.name)
-    ]
+    for number, (name, update) in enumerate(updates.items()):
+        joints.append(_joint(choice, number, name, update, updated))
+    not_in_urdf = []
+    for column, value in zip(choice.model.columns, choice.standard, strict=True):
+        if _is_of_motor(column.name):
+            not_in_urdf.append(NotInUrdf.of(column, value=value))
     effects = [f"{effect.name} on {effect.axis}" for effect in calibration.effects]
     effects += missing
-    closures = [closure.name for closure in parameters.model.robot.closures]
+    closures = [closure.name for closure in choice.model.robot.closures]
     return UrdfReport.of(
-        parameters,
+        choice.robot.parameters,
         urdf=out,
         calibration=calibration.cell or None,
         same_configuration=same_configuration,
@@ -222,12 +223,17 @@ def urdf_report(
 
 
 def _is_of_motor(name: str) -> bool:
-    """Whether a parameter is of a motor, which a URDF has no place for."""
+    """Whether a parameter is of a motor, which a URDF has no place for.
+
+    What a payload adds to friction (LOADED) is no part of the robot without one.
+    """
     return name.startswith(("Ia", "off", "fvm", "fsm")) and not name.endswith(LOADED)
 
 
-def _joint(choice: FullChoice, number: int, update: JointUpdate, updated: Updated) -> UrdfJoint:
-    name = choice.model.robot.joints[number].name
+def _joint(
+    choice: FullChoice, number: int, name: str, update: JointUpdate, updated: Updated
+) -> UrdfJoint:
+    """Return a joint, whose number is its place among the robot's joints."""
     return UrdfJoint.of(
         update,
         update.body,

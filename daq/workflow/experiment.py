@@ -15,7 +15,7 @@ from daq.config.workspace import DEFAULT_MINIMUM_M, Clearance
 from daq.errors import ConfigurationInconsistent
 from drivers.move import Trapezoid, synchronised
 from ident.arrays import BoolArray, FloatArray
-from ident.model.robot import JointKind, Motion, Robot, poses
+from ident.model.robot import JointKind, Motion, Poses, Robot, poses
 from ident.planning.clear_way import farthest_towards
 from ident.planning.clearance import BASE, Capsule, Checker, Scene
 from ident.planning.effort import believable_efforts, effort_shares
@@ -50,21 +50,21 @@ def limits_of(cell: Cell) -> JointLimits:
     )
 
 
-LINK_RADIUS = 0.08
+LINK_RADIUS_SHARE = 0.08
 """Radius of a guessed link, as a share of the length of the joint chain:
 6 cm for an arm of the TX-40's size.
 """
-POSTURES = 400
+POSTURES = 400  #: Random postures in which capsules are compared
 PAYLOAD = "payload"  #: Name of the capsule of a body that no capsule declares
-ALWAYS = 0.03
-"""Two capsules that are apart in a smaller share of random postures belong together,
-as at a shared joint.
+LEAST_APART_SHARE = 0.03
+"""Two capsules that are apart in no larger share of random postures are not checked against each
+other: they touch in nearly every posture, as at a shared joint.
 """
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CheckedScene:
-    """A scene with what must be said of it."""
+    """A scene, and what an operator must know of it."""
 
     checker: Checker  #: answers whether a way is clear
     guessed: bool  #: the arm's shape is a guess
@@ -75,14 +75,17 @@ class CheckedScene:
     def remarks(self) -> tuple[str, ...]:
         """Remarks for the operator."""
         scene = self.checker.scene
-        if self.guessed:
-            known = "guessed from the joint chain; declare `clearance` in the cell file"
-        else:
-            known = "as declared"
-        shape = f"shape of the arm: {len(scene.capsules)} capsules, {known}"
-        if self.guessed and self.checker.robot.is_constrained:
+        count = len(scene.capsules)
+        if not self.guessed:
+            shape = f"shape of the arm: {count} capsules, as declared"
+        elif self.checker.robot.is_constrained:
             shape = (
                 "shape of the links: unknown, of a closed chain it is not guessed; declare "
+                "`clearance` in the cell file"
+            )
+        else:
+            shape = (
+                f"shape of the arm: {count} capsules, guessed from the joint chain; declare "
                 "`clearance` in the cell file"
             )
         lines = [shape, f"clearance: {1000 * scene.minimum_m:.0f} mm"]
@@ -100,98 +103,121 @@ class CheckedScene:
 
 
 def scene_of(cell: Cell, robot: Robot, mass_kg: float) -> CheckedScene:
-    """The cell's own capsules, or guessed ones, and the pairs of them that must keep apart."""
+    """Return the scene of a cell: its declared capsules, or guessed ones, one for the payload,
+    and the pairs of capsules that must keep apart.
+
+    Args:
+        cell: with limits and clearance.
+        robot: of the cell.
+        mass_kg: of the payload, which gives the size of its capsule where none is declared.
+    """
     declared = cell.clearance or Clearance(None, DEFAULT_MINIMUM_M, (), ())
     capsules = declared.capsules or guessed_capsules(robot)
-    last = robot.carrier
-    if not any(capsule.link == last for capsule in capsules):
-        # Around a steel body of that mass, from where it is mounted to three of its sides away.
-        side = side_of_cube(mass_kg)
-        axis = robot.joints[last].axis
-        at = robot.mounting_m
-        begin = point_of(at + side * axis)
-        end = point_of(at + 2.0 * side * axis)
-        capsules = (
-            *capsules,
-            Capsule(PAYLOAD, last, begin, end, side),
-        )
+    carrier = robot.carrier
+    if not any(capsule.link == carrier for capsule in capsules):
+        # Around a steel cube of that mass: from the mounting to three of its sides away, with the
+        # round ends.
+        side_m = side_of_cube(mass_kg)
+        axis = robot.joints[carrier].axis
+        start_m = point_of(robot.mounting_m + side_m * axis)
+        end_m = point_of(robot.mounting_m + 2.0 * side_m * axis)
+        payload = Capsule(PAYLOAD, carrier, start_m, end_m, radius_m=side_m)
+        capsules = (*capsules, payload)
+    candidates = _pairs_of_separate_links(robot, capsules)
+    confined = tuple(index for index, capsule in enumerate(capsules) if capsule.link == carrier)
+    scene_of_all_pairs = Scene(
+        capsules=capsules,
+        pairs=candidates,
+        boxes=declared.obstacles,
+        workspace=declared.workspace,
+        confined=confined,
+        minimum_m=declared.minimum_m,
+    )
+    limits = limits_of(cell)
+    rng = np.random.default_rng(0)
+    postures = rng.uniform(limits.lower, limits.upper, (POSTURES, len(cell.axes)))
+    # Two guessed capsules that never keep the least distance are as little worth checking as two
+    # that always touch: each grows by half of that distance.
+    grown = []
+    for capsule in capsules:
+        radius_m = capsule.radius_m
+        is_guessed = not declared.capsules or capsule.name == PAYLOAD
+        if is_guessed:
+            radius_m += 0.5 * declared.minimum_m
+        grown.append(replace(capsule, radius_m=radius_m))
+    grown_scene = replace(scene_of_all_pairs, capsules=tuple(grown))
+    apart_shares = Checker(robot, grown_scene).apart(postures)
+    are_apart = apart_shares > LEAST_APART_SHARE
+    pairs = []
+    together = []
+    for (first, second), is_apart in zip(candidates, are_apart, strict=True):
+        if is_apart:
+            pairs.append((first, second))
+        else:
+            together.append((capsules[first].name, capsules[second].name))
+    scene = replace(scene_of_all_pairs, pairs=tuple(pairs))
+    return CheckedScene(
+        checker=Checker(robot, scene),
+        guessed=not declared.capsules,
+        together=tuple(together),
+    )
+
+
+def _pairs_of_separate_links(
+    robot: Robot, capsules: Sequence[Capsule]
+) -> tuple[tuple[int, int], ...]:
+    """Return the pairs of capsules on different links without a common joint, by their indices."""
     links = [capsule.link for capsule in capsules]
-    parents = [robot.joints[link].parent if link != BASE else None for link in links]
-    candidates = []
+    parents: list[int | None] = []
+    for link in links:
+        parent = None
+        if link != BASE:
+            parent = robot.joints[link].parent
+        parents.append(parent)
+    pairs = []
     for second in range(len(capsules)):
         for first in range(second):
             is_same = links[first] == links[second]
             is_joined = links[first] == parents[second] or parents[first] == links[second]
             if not is_same and not is_joined:
-                candidates.append((first, second))
-    confined = tuple(index for index, capsule in enumerate(capsules) if capsule.link == last)
-    everything = Scene(
-        capsules,
-        tuple(candidates),
-        declared.obstacles,
-        declared.workspace,
-        confined,
-        declared.minimum_m,
-    )
-    limits = limits_of(cell)
-    rng = np.random.default_rng(0)
-    postures = rng.uniform(limits.lower, limits.upper, (POSTURES, len(cell.axes)))
-    # Of a guessed shape, a pair that never keeps the distance belongs together as one that always
-    # touches does.
-    is_guessed = [not declared.capsules or capsule.name == PAYLOAD for capsule in capsules]
-    grown = []
-    for capsule, guessed in zip(capsules, is_guessed, strict=True):
-        margin_m = 0.5 * declared.minimum_m if guessed else 0.0
-        grown.append(replace(capsule, radius_m=capsule.radius_m + margin_m))
-    grown_scene = replace(everything, capsules=tuple(grown))
-    apart = Checker(robot, grown_scene).apart(postures) > ALWAYS
-    pairs = []
-    together = []
-    for (first, second), is_apart in zip(candidates, apart, strict=True):
-        if is_apart:
-            pairs.append((first, second))
-        else:
-            together.append((capsules[first].name, capsules[second].name))
-    scene = replace(everything, pairs=tuple(pairs))
-    return CheckedScene(Checker(robot, scene), not declared.capsules, tuple(together))
+                pairs.append((first, second))
+    return tuple(pairs)
 
 
 def guessed_capsules(robot: Robot) -> tuple[Capsule, ...]:
-    """One from each joint to the next revolute one;
+    """Guess a capsule from each joint to the next one;
     the far end is drawn in, so that a bent elbow is no collision.
 
-    A way along a prismatic joint changes its length, and a guess would be no better than none:
-    those links get none. Neither do those of a closed chain, whose legs lie in front of and behind
-    each other.
+    Links at a prismatic joint get none: their length changes, and a guess would be no better than
+    none. Neither do those of a closed chain, whose legs lie in front of and behind each other.
     """
     if robot.is_constrained:
         return ()
     lengths_m = [float(np.linalg.norm(joint.translation_m)) for joint in robot.joints]
-    radius = LINK_RADIUS * max(sum(lengths_m), 0.1)
+    radius_m = LINK_RADIUS_SHARE * max(sum(lengths_m), 0.1)
     capsules = []
-    for joint in robot.joints:
-        length = float(np.linalg.norm(joint.translation_m))
-        if joint.parent != BASE:
-            before = robot.joints[joint.parent].kind
-        else:
-            before = JointKind.REVOLUTE
-        if length <= 2.0 * radius or JointKind.PRISMATIC in (joint.kind, before):
-            continue
-        end = joint.translation_m * (1.0 - radius / length)
+    for joint, length_m in zip(robot.joints, lengths_m, strict=True):
         if joint.parent == BASE:
             name = "base"
+            parent_kind = JointKind.REVOLUTE
         else:
             name = f"link {joint.parent + 1}"
-        capsules.append(Capsule(name, joint.parent, (0.0, 0.0, 0.0), point_of(end), radius))
+            parent_kind = robot.joints[joint.parent].kind
+        is_prismatic = JointKind.PRISMATIC in (joint.kind, parent_kind)
+        is_short = length_m <= 2.0 * radius_m
+        if is_prismatic or is_short:
+            continue
+        end_m = joint.translation_m * (1.0 - radius_m / length_m)
+        capsules.append(Capsule(name, joint.parent, (0.0, 0.0, 0.0), point_of(end_m), radius_m))
     return tuple(capsules)
 
 
 def point_of(vector: FloatArray) -> tuple[float, float, float]:
-    """Return a vector as a place."""
+    """Return a vector of shape (3,) as a tuple."""
     return float(vector[0]), float(vector[1]), float(vector[2])
 
 
-#: What is mounted while the moves are made: nothing, then the payload
+#: What is mounted at each repetition of the moves: nothing, then the payload, by its number
 RUNS: tuple[int | None, ...] = (None, 0)
 
 
@@ -209,28 +235,37 @@ class Experiment:
     #: (n,).
     effort: FloatArray
     remarks: tuple[str, ...]  #: what was assumed, in words
-    #: what is mounted at each repetition of the moves: payload or None
+    #: what is mounted at each repetition of the moves: number of the payload, None without load
     mounted: tuple[int | None, ...] = RUNS
 
     def excitation(
         self, paths: Sequence[Trapezoid], thinning: int = 1
     ) -> tuple[Excitation, tuple[slice, ...]]:
-        """Rows of several moves, one after the other, and which of them belong to which move."""
-        period = self.row_s * thinning
-        times = [np.arange(0.5 * period, path.duration_s, period) for path in paths]
-        parts = [path.at(time) for path, time in zip(paths, times, strict=True)]
-        motion = _joined(parts)
-        uses = [self._use(path, time) for path, time in zip(paths, times, strict=True)]
-        use = np.concatenate(uses, axis=1)
-        ends = np.cumsum([len(time) for time in times])
+        """Return the rows of several moves, one after the other, and a slice of them for each move.
+
+        Args:
+            paths: of the moves.
+            thinning: only every so many-th row is made.
+        """
+        period_s = self.row_s * thinning
+        motions = []
+        uses = []
         slices = []
-        for end, time in zip(ends.tolist(), times, strict=True):
-            slices.append(slice(end - len(time), end))
+        row_count = 0
+        for path in paths:
+            time_s = np.arange(0.5 * period_s, path.duration_s, period_s)
+            motions.append(path.at(time_s))
+            uses.append(self._use(path, time_s))
+            slices.append(slice(row_count, row_count + len(time_s)))
+            row_count += len(time_s)
+        motion = _joined(motions)
+        use = np.concatenate(uses, axis=1)
         return Excitation(motion, use), tuple(slices)
 
     def informations(self, paths: Sequence[Trapezoid], thinning: int = 1) -> list[FloatArray]:
-        """Information of each move with everything that is mounted in turn,
-        all from one regressor.
+        """Return the information of each move, summed over what is mounted in turn.
+
+        One regressor serves all moves. Where rows are thinned out, each counts for those left out.
         """
         if not paths:
             return []
@@ -243,53 +278,54 @@ class Experiment:
         return informations
 
     def effort_shares(self, paths: Sequence[Trapezoid]) -> FloatArray:
-        """Largest expected torque of each axis on each way, over its limit; shape (ways, n).
-
-        It is that with the heavier of the payloads that are mounted in turn.
+        """Return the largest expected torque of each axis on each path over its effort limit,
+        with whatever is mounted in turn, shape (paths, n).
         """
         if not paths or not np.isfinite(self.effort).any():
             return np.zeros((len(paths), len(self.effort)))
-        times = [_torque_times(path) for path in paths]
-        motions = [path.at(time) for path, time in zip(paths, times, strict=True)]
-        motion = _joined(motions)
+        motion = _joined([path.at(_torque_times(path)) for path in paths])
         shares = effort_shares(self.design.expectation, self.effort, motion, self.mounted)
-        of_ways = shares.reshape(len(self.effort), len(paths), -1)
-        return np.asarray(of_ways.max(axis=2).T)
+        # Every path has as many torque times: axes, paths, times
+        by_path = shares.reshape(len(self.effort), len(paths), -1)
+        return np.asarray(by_path.max(axis=2).T)
 
     def _use(self, path: Trapezoid, time_s: FloatArray) -> BoolArray:
-        """Rows of each motor that count; the same rule as ident/equations/rows.py,
-        for moves from rest to rest.
+        """Return which rows of each motor count, shape (motors, k);
+        the same rule as in ident/equations/rows.py, for moves from rest to rest.
         """
-        train = self.design.expectation.model.drive_train
+        model = self.design.expectation.model
+        train = model.drive_train
         # On a trapezoid a joint is slowest at the ends of a row's window.
         early = path.at(time_s - self.edge_s)[1].T
         late = path.at(time_s + self.edge_s)[1].T
         declared_rad_s = self.cell.conditioning.standstill_rad_s or (0.0,) * len(early)
         standstill = np.array(declared_rad_s)[:, None]
         slowest = np.minimum(np.abs(early), np.abs(late))
-        moving = slowest > standstill
+        joint_moves = slowest > standstill
         motor_early = np.abs(train.direction @ early)
         motor_late = np.abs(train.direction @ late)
-        turned = np.minimum(motor_early, motor_late) > standstill
-        is_moved = np.abs(train.to_motor) > 0
-        is_loaded = np.abs(train.direction) > 0
-        needed = is_moved | is_loaded
+        motor_moves = np.minimum(motor_early, motor_late) > standstill
+        # Motor i's equation mixes the joints in row i of T; each of them must move.
+        is_mixed = np.abs(train.to_motor) > 0
+        is_turned = np.abs(train.direction) > 0
         uses = []
-        for motor, has_turned in enumerate(turned):
-            all_moving = moving[needed[motor]].all(axis=0)
-            uses.append(all_moving & has_turned)
+        for motor, moves in enumerate(motor_moves):
+            joints = is_mixed[motor] | is_turned[motor]
+            all_move = joint_moves[joints].all(axis=0)
+            uses.append(all_move & moves)
         use = np.stack(uses)
-        if self.design.expectation.model.is_redundant:
+        if model.is_redundant:
             use &= use.all(axis=0)
         return use
 
 
 def experiment_of(cell: Cell, payload: str | None = None) -> Experiment:
-    """Expectation of a cell's arm: inertias of the URDF, stated guesses for the rest,
-    nameplate gains.
+    """Return the experiment of a cell, with the expected arm: inertias of the URDF,
+    guesses for the rest, which the remarks state, and nameplate gains.
 
     Args:
-        payload: name of it, None for the first.
+        cell: of the arm.
+        payload: name of the payload, None for the first.
 
     Raises:
         ConfigurationInconsistent: the cell declares no payload, or none of that name.
@@ -297,53 +333,73 @@ def experiment_of(cell: Cell, payload: str | None = None) -> Experiment:
     found = [declared for declared in cell.payloads if payload in (None, declared.name)]
     if not found:
         known = ", ".join(declared.name for declared in cell.payloads)
+        lacking = "none"
+        if payload is not None:
+            lacking = f"no payload {payload!r}"
         raise ConfigurationInconsistent(
             f"payloads of cell {cell.name!r}",
-            found="none" if payload is None else f"no payload {payload!r}",
+            found=lacking,
             expected=known or "a weighed payload",
             remedy="the gains need a known mass: give a declared name, or weigh a body and "
             "declare it under `payloads`",
         )
-    mounted = found[0]
+    weighed = found[0]
     model = model_of(cell)
-    expected = nominal_payload(model.robot, mounted.drawn)
+    expected_payload = nominal_payload(model.robot, weighed.drawn)
     limits = limits_of(cell)
-    fast_motion = _fast_motion(limits, Checker(model.robot, NOTHING))
+    fast_motion = _fast_motion(limits, Checker(model.robot, EMPTY_SCENE))
     gains = np.array([axis.nameplate_gain for axis in cell.axes])
     expectation, from_urdf = nominal_expectation(
-        model, cell.urdf, gains, expected, limits, fast_motion
+        model, cell.urdf, gains, expected_payload, limits, fast_motion
     )
-    scene = scene_of(cell, model.robot, mounted.mass_kg)
-    source = "from the URDF" if from_urdf else "guessed"
+    scene = scene_of(cell, model.robot, weighed.mass_kg)
+    design = Design(expectation, visible_base(model, fast_motion))
+    row_s, edge_s = rows_between_rests(cell.conditioning)
+    declared_effort = declared_efforts(model, cell.urdf)
+    effort = believable_efforts(expectation, declared_effort, fast_motion.position_rad, RUNS)
+    source = "guessed"
+    if from_urdf:
+        source = "from the URDF"
     noise_percent = 100 * NOISE_SHARE
     remarks = (
-        f"payload: {mounted.name}, {mounted.mass_kg:g} kg",
+        f"payload: {weighed.name}, {weighed.mass_kg:g} kg",
         f"masses of the links: {source}",
         f"noise: {noise_percent:g} % of each motor's current at its torque limit, correlation "
         f"{LAG_ONE:g} from row to row",
         *scene.remarks,
+        *_effort_remarks(cell, declared_effort, effort, from_urdf=from_urdf),
     )
-    design = Design(expectation, visible_base(model, fast_motion))
-    period, edge = rows_between_rests(cell.conditioning)
-    declared = declared_efforts(model, cell.urdf)
-    effort = believable_efforts(expectation, declared, fast_motion.position_rad, RUNS)
-    remarks = (*remarks, *_effort_remarks(cell, declared, effort, from_urdf=from_urdf))
-    return Experiment(cell, design, scene, mounted, period, edge, effort, remarks)
+    return Experiment(
+        cell=cell,
+        design=design,
+        scene=scene,
+        payload=weighed,
+        row_s=row_s,
+        edge_s=edge_s,
+        effort=effort,
+        remarks=remarks,
+    )
 
 
 def _effort_remarks(
     cell: Cell, declared: FloatArray, believed: FloatArray, *, from_urdf: bool
 ) -> tuple[str, ...]:
-    """Say which axes have no effort limit that moves could be kept below;
-    masses of the links may be guessed.
+    """Say which axes have no effort limit that planned moves could stay below.
+
+    Args:
+        cell: of the arm.
+        declared: effort limits of the URDF, inf where it has none, shape (n,).
+        believed: the same, and inf where gravity alone exceeds them, shape (n,).
+        from_urdf: whether the masses of the links are from the URDF, not guessed.
     """
     lines: list[str] = []
     unknown: list[str] = []
     refuted: list[str] = []
-    for name, of_urdf, limit in zip(cell.axis_names, declared, believed, strict=True):
-        if np.isinf(of_urdf):
+    limits = zip(cell.axis_names, declared, believed, strict=True)
+    for name, declared_limit, believed_limit in limits:
+        if np.isinf(declared_limit):
             unknown.append(name)
-        elif np.isinf(limit):
+        elif np.isinf(believed_limit):
             refuted.append(name)
     if unknown:
         lines.append(
@@ -363,14 +419,14 @@ def _effort_remarks(
 
 
 PIECE_SHARES = np.array([0.01, 0.25, 0.5, 0.75, 0.99])
-"""Where the torque is looked at in each piece of a trapezoid:
+"""Shares of each piece of a trapezoid at which the torque is computed:
 near its ends, where it jumps, and between.
 """
 
 
 def _torque_times(path: Trapezoid) -> FloatArray:
-    """Times at which the torque of a move may be largest [s], also at rest before and after it;
-    as many for each.
+    """Return times at which the torque of a move may be largest [s], also at rest before and after
+    it; as many for every move.
     """
     corners = (0.0, path.ramp_s, path.duration_s - path.ramp_s, path.duration_s)
     pieces = [begin + PIECE_SHARES * (end - begin) for begin, end in pairwise(corners)]
@@ -378,12 +434,15 @@ def _torque_times(path: Trapezoid) -> FloatArray:
     return np.concatenate([*pieces, at_rest])
 
 
-NOTHING = Scene((), (), (), None, (), 0.0)  #: Without bodies, a checker knows what closures allow
+#: Scene without bodies: a checker of it knows the closures of a robot alone
+EMPTY_SCENE = Scene((), (), (), None, (), 0.0)
 
 
 def _fast_motion(limits: JointLimits, checker: Checker) -> Motion:
-    """Random moves as fast as the limits allow:
-    which parameters there are does not depend on a plan's seed.
+    """Return random moves as fast as the limits allow.
+
+    They are the same every time: which parameters are identifiable must not depend on a plan's
+    seed.
     """
     rng = np.random.default_rng(0)
     targets = rng.uniform(limits.lower, limits.upper, (40, len(limits.lower)))
@@ -399,24 +458,33 @@ def _fast_motion(limits: JointLimits, checker: Checker) -> Motion:
 
 def _joined(parts: Sequence[tuple[FloatArray, ...]]) -> Motion:
     """Join motions of positions, velocities and accelerations, one after the other."""
-    return Motion(*map(np.concatenate, zip(*parts, strict=True)))
+    position_rad, velocity_rad_s, acceleration_rad_s2 = zip(*parts, strict=True)
+    return Motion(
+        np.concatenate(position_rad),
+        np.concatenate(velocity_rad_s),
+        np.concatenate(acceleration_rad_s2),
+    )
 
 
 def _allowed(
     checker: Checker, rng: np.random.Generator, lower: FloatArray, upper: FloatArray, count: int
 ) -> FloatArray:
-    """Positions of a closed chain that can be reached one after the other, shape (count, m)."""
-    found = [checker.home]
-    while len(found) <= count:
-        posture = rng.uniform(lower, upper)
-        found.append(towards(checker, found[-1], posture, lower, upper))
-    return np.array(found[1:])
+    """Return positions of a closed chain that can be reached one after the other,
+    shape (count, m).
+    """
+    found = []
+    here = checker.home
+    for _ in range(count):
+        target = rng.uniform(lower, upper)
+        here = towards(checker, here, target, lower, upper)
+        found.append(here)
+    return np.array(found)
 
 
 def towards(
     checker: Checker, start: FloatArray, target: FloatArray, lower: FloatArray, upper: FloatArray
 ) -> FloatArray:
-    """The farthest position that a closed chain can go to on the way to a target;
+    """Return the farthest position that a closed chain can go to on the way to a target;
     the start where there is none.
 
     Args:
@@ -425,7 +493,9 @@ def towards(
         lower, upper: limits of the axes, shape (m,).
     """
     found = farthest_towards(checker, start, target, lower, upper)
-    return start if found is None else found
+    if found is None:
+        return start
+    return found
 
 
 @dataclass(frozen=True, slots=True)
@@ -440,7 +510,7 @@ class PlannedMove:
 
 
 def path_of(cell: Cell, start_rad: FloatArray, move: PlannedMove) -> Trapezoid:
-    """The joint trapezoid of a move from the robot's position."""
+    """Return the joint trapezoid of a move from the robot's position."""
     limits = limits_of(cell)
     velocity = limits.velocity * move.velocity
     acceleration = limits.acceleration * move.acceleration
@@ -448,26 +518,32 @@ def path_of(cell: Cell, start_rad: FloatArray, move: PlannedMove) -> Trapezoid:
 
 
 def paths_of(cell: Cell, moves: Sequence[PlannedMove]) -> tuple[Trapezoid, ...]:
-    """Paths of all moves but the first, whose start is unknown."""
-    starts = (np.array(move.target_rad) for move in moves)
-    return tuple(path_of(cell, start, move) for start, move in zip(starts, moves[1:], strict=False))
+    """Return the paths of all moves but the first, whose start is unknown."""
+    paths = []
+    for before, move in pairwise(moves):
+        start_rad = np.array(before.target_rad)
+        paths.append(path_of(cell, start_rad, move))
+    return tuple(paths)
 
 
 def experiment_duration_s(cell: Cell, moves: Sequence[PlannedMove]) -> float:
-    """From the first target to the end of the last dwell [s]."""
+    """Return the time from the first target to the end of the last dwell [s]."""
     motion_s = sum(path.duration_s for path in paths_of(cell, moves))
     dwell_s = sum(move.dwell_s for move in moves)
     return float(motion_s + dwell_s)
 
 
-SECONDS = 5.0  #: Duration of the extra moves of each kind, so that the kinds can be compared
-EXTRA_POSTURES = 300
-SLOW = 0.2  #: Share of the speed limit at which gravity excites more than inertia
+#: Least duration of the extra moves of each kind, so that the kinds can be compared
+EXTRA_MOVES_S = 5.0
+EXTRA_POSTURES = 300  #: Random postures in which extra moves are tried
+SWINGS = 3  #: Most postures in which the extra moves of one kind are made
+SLOW_SHARE = 0.2  #: Share of the speed limit at which gravity excites more than inertia
 STROKES = (1.0, 0.7, 0.4)  #: Shares of the range that are tried until the way is clear
 
 
 def extra_moves(experiment: Experiment) -> tuple[ExtraMoves, ...]:
-    """Some five seconds of each kind, within limits and clear of everything; the same every time.
+    """Return extra moves of each kind, for EXTRA_MOVES_S or a little more, within limits and clear
+    of everything; the same every time.
 
     For every axis: fast with the arm stretched, fast with it folded (as the payload's link is seen
     from that axis), slow with it stretched, and fast together with a neighbour; and of all axes
@@ -484,56 +560,67 @@ def extra_moves(experiment: Experiment) -> tuple[ExtraMoves, ...]:
         sampled = _allowed(checker, rng, low, high, EXTRA_POSTURES // 15)
     clear = sampled[checker.margins(sampled) > 0.0]
     found: list[ExtraMoves] = []
-    ends_of = _swing_of_chain if checker.robot.is_constrained else _swing
+    ends_of = _swing
+    if checker.robot.is_constrained:
+        ends_of = _swing_of_chain
 
     def swing(words: str, postures: FloatArray, moved: list[int], speed: float = 1.0) -> None:
-        """There and back in the first few postures in which that is clear."""
+        """Add moves there and back in the first few postures in which the way is clear."""
         paths: list[Trapezoid] = []
         for posture in postures:
             ends = ends_of(checker, posture, moved, low, high)
             if ends is not None:
-                there = synchronised(*ends, limits.velocity * speed, limits.acceleration)
-                paths += [there, Trapezoid(there.end, there.start, there.duration_s, there.ramp_s)]
-            if len(paths) >= 6:
+                start, end = ends
+                there = synchronised(start, end, limits.velocity * speed, limits.acceleration)
+                back = replace(there, start=there.end, end=there.start)
+                paths += [there, back]
+            if len(paths) >= 2 * SWINGS:
                 break
         chosen: list[Trapezoid] = []
-        seconds = 0.0
+        duration_s = 0.0
         for path in cycle(paths):
             chosen.append(path)
-            seconds += path.duration_s
-            if seconds >= SECONDS:
+            duration_s += path.duration_s
+            if duration_s >= EXTRA_MOVES_S:
                 break
         if chosen:
-            found.append(ExtraMoves(words, seconds, experiment.excitation(chosen)[0]))
+            excitation, _ = experiment.excitation(chosen)
+            found.append(ExtraMoves(words, duration_s, excitation))
 
     names = cell.axis_names
     robot = experiment.design.expectation.model.robot
-    at = poses(robot, checker.joints(clear))
+    frames = poses(robot, checker.joints(clear))
     for axis, (name, joint) in enumerate(zip(names, robot.axis_joints, strict=True)):
-        # Distance of the link with the payload from the axis; of a prismatic one, from the axis'
-        # own frame [m].
-        carrier_m = at.origin_m[robot.carrier + 1]
-        way = carrier_m - at.origin_m[joint + 1]
-        if robot.joints[joint].kind is not JointKind.PRISMATIC:
-            axis_of_joint = at.rotation[joint + 1] @ robot.joints[joint].axis
-            way = np.cross(axis_of_joint, way)
-        lever = np.linalg.norm(way, axis=1)
-        stretched = clear[np.argsort(-lever, kind="stable")]
-        folded = clear[np.argsort(lever, kind="stable")]
+        lever_m = _lever_of_carrier(robot, frames, joint)
+        stretched = clear[np.argsort(-lever_m, kind="stable")]
+        folded = clear[np.argsort(lever_m, kind="stable")]
         swing(f"fast moves of {name} with the arm stretched", stretched, [axis])
         swing(f"fast moves of {name} with the arm folded", folded, [axis])
-        swing(f"slow moves of {name} with the arm stretched", stretched, [axis], SLOW)
-        other = axis + 1 if axis + 1 < len(names) else axis - 1
+        swing(f"slow moves of {name} with the arm stretched", stretched, [axis], SLOW_SHARE)
+        other = axis + 1
+        if other == len(names):
+            other = axis - 1
         if other >= 0:
             swing(f"fast moves of {name} and {names[other]} together", clear, [axis, other])
     swing("fast moves of all axes", clear, list(range(len(names))))
     return tuple(found)
 
 
+def _lever_of_carrier(robot: Robot, frames: Poses, joint: int) -> FloatArray:
+    """Return the distance of the link with the payload from the axis of a joint [m], shape (k,);
+    of a prismatic joint, from the origin of its frame.
+    """
+    to_carrier_m = frames.origin_m[robot.carrier + 1] - frames.origin_m[joint + 1]
+    if robot.joints[joint].kind is JointKind.PRISMATIC:
+        return np.asarray(np.linalg.norm(to_carrier_m, axis=1))
+    direction = frames.rotation[joint + 1] @ robot.joints[joint].axis
+    return np.asarray(np.linalg.norm(np.cross(direction, to_carrier_m), axis=1))
+
+
 def _swing(
     checker: Checker, posture: FloatArray, moved: list[int], low: FloatArray, high: FloatArray
 ) -> tuple[FloatArray, FloatArray] | None:
-    """Both ends of the longest clear swing of some axes about the middle of their range;
+    """Return both ends of the longest clear swing of some axes about the middle of their range;
     None where there is none.
     """
     for stroke in STROKES:
@@ -550,14 +637,15 @@ def _swing(
 def _swing_of_chain(
     checker: Checker, posture: FloatArray, moved: list[int], low: FloatArray, high: FloatArray
 ) -> tuple[FloatArray, FloatArray] | None:
-    """The same where the other axes follow, as far as the closures allow;
-    None where that is nowhere.
+    """Return the same for a closed chain, whose closures bound the swing;
+    None where they leave none.
     """
-    ends: list[FloatArray] = []
-    for limit in (low, high):
-        target = posture.copy()
-        target[moved] = limit[moved]
-        ends.append(towards(checker, ends[-1] if ends else posture, target, low, high))
-    if np.allclose(ends[0], ends[1]):
+    low_target = posture.copy()
+    low_target[moved] = low[moved]
+    start = towards(checker, posture, low_target, low, high)
+    high_target = posture.copy()
+    high_target[moved] = high[moved]
+    end = towards(checker, start, high_target, low, high)
+    if np.allclose(start, end):
         return None
-    return (ends[0], ends[1])
+    return start, end

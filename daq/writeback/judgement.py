@@ -1,5 +1,5 @@
 """Whether gains differ from those in a controller by more than noise:
-one answer for dry run, drives, page and job.
+dry run, write, certificate and job all ask here, so that they agree.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ Within it both are the same gain; the difference is the rounding in the controll
 
 
 @dataclass(frozen=True, slots=True)
-class Spread:
-    """Figures of a history that a change is judged by; empty without a history."""
+class HistoryFigures:
+    """σ and scatter of gains by a history, by which a change is judged; empty without a history."""
 
     #: σ of the current gains, by axis [unit of the gain]. A gain without σ, or with a σ of 0, is
     #: taken as exact: a person entered it, or the history does not have it.
@@ -40,7 +40,7 @@ class Spread:
     dispersions: Mapping[str, float] = field(default_factory=dict)
 
 
-NOTHING = Spread()
+NO_HISTORY = HistoryFigures()
 """Figures of a cell without a history."""
 
 
@@ -59,15 +59,16 @@ NOT_JUDGED = JudgedChange()
 """Judgement of a gain whose numbers are not finite."""
 
 
-def query_history(
+def read_history_figures(
     cell: Cell,
     target: str,
     request: Request,
     changes: Sequence[GainChange],
     audit: Path | None = None,
-) -> Spread:
-    """Return the figures of a cell's history; without one, or with a warning if it cannot be read,
-    `NOTHING`.
+) -> HistoryFigures:
+    """Return the figures of a cell's history for the current gains.
+
+    They are `NO_HISTORY` for a cell without one, and, with a warning, where it cannot be read.
 
     Args:
         cell: as it is now.
@@ -78,14 +79,14 @@ def query_history(
     """
     ledger = Ledger.of(cell, audit)
     if ledger is None:
-        return NOTHING
+        return NO_HISTORY
     try:
         history = read_history(ledger)
     except DaqError as error:
         _LOG.warning(
             "the history cannot be read, so the current gains are taken as exact: %s", error
         )
-        return NOTHING
+        return NO_HISTORY
     if history.may_lack:
         _LOG.warning(MAY_LACK)
     if history.renamed is not None:
@@ -94,11 +95,13 @@ def query_history(
             cell.name,
             history.renamed.new,
         )
-    digest = sha256(request.signed)
-    return known_of(history, target, digest, changes)
+    digest = sha256(request.signed)  # of the calibration as a file
+    return figures_of_history(history, target, digest, changes)
 
 
-def known_of(history: History, target: str, digest: str, changes: Sequence[GainChange]) -> Spread:
+def figures_of_history(
+    history: History, target: str, digest: str, changes: Sequence[GainChange]
+) -> HistoryFigures:
     """Return the figures of a history for the current gains.
 
     The σ of a current gain is found in this order:
@@ -123,11 +126,11 @@ def known_of(history: History, target: str, digest: str, changes: Sequence[GainC
         candidates = list(history.entries)
     else:
         candidates = others
-    # Oldest first, then the one in force: the last one with the gain counts.
-    candidates = sorted(candidates, key=lambda entry: entry.digest == in_force)
+    # Oldest first, the one in force last: a later one with the gain replaces those before.
+    by_precedence = sorted(candidates, key=lambda entry: entry.digest == in_force)
     current_gains = {change.axis: change.compared_gain for change in changes}
     stds = dict.fromkeys(current_gains, 0.0)
-    for entry in candidates:
+    for entry in by_precedence:
         for gain in entry.gains:
             if gain.axis not in current_gains:
                 continue
@@ -136,10 +139,12 @@ def known_of(history: History, target: str, digest: str, changes: Sequence[GainC
                 stds[gain.axis] = gain.std
     axes = tuple(current_gains)
     dispersions = dispersions_of(others, axes)
-    return Spread(stds, dispersions)
+    return HistoryFigures(stds, dispersions)
 
 
-def judge(changes: Sequence[GainChange], known: Spread) -> tuple[dict[str, JudgedChange], str]:
+def judge(
+    changes: Sequence[GainChange], figures: HistoryFigures
+) -> tuple[dict[str, JudgedChange], str]:
     """Judge changes by axis, and say the result in one sentence.
 
     Gains with numbers that are not finite are left out: the gate `finite_gains` refuses them.
@@ -147,10 +152,10 @@ def judge(changes: Sequence[GainChange], known: Spread) -> tuple[dict[str, Judge
     comparable = [change for change in changes if _is_comparable(change)]
     axes = tuple(change.axis for change in comparable)
     current_gains = [change.compared_gain for change in comparable]
-    current_stds = [known.stds.get(axis, 0.0) for axis in axes]
+    current_stds = [figures.stds.get(axis, 0.0) for axis in axes]
     new_gains = [change.new for change in comparable]
     new_stds = [change.std for change in comparable]
-    dispersions = [known.dispersions.get(axis, DISPERSION) for axis in axes]
+    dispersions = [figures.dispersions.get(axis, DISPERSION) for axis in axes]
     decision = decide(
         axes,
         current_gains,
@@ -173,9 +178,12 @@ def _is_comparable(change: GainChange) -> bool:
     return is_finite and change.std >= 0.0
 
 
-def noise_note(changes: Sequence[GainChange], known: Spread) -> str:
-    """Say what "more than noise" means for these changes, all from the same kind of gain."""
-    exact = [change for change in changes if not known.stds.get(change.axis)]
+def noise_note(changes: Sequence[GainChange], figures: HistoryFigures) -> str:
+    """Say what "more than noise" means for these changes.
+
+    All of them are compared with gains of one origin, such as the current gains.
+    """
+    exact = [change for change in changes if not figures.stds.get(change.axis)]
     sigma_note = "σ of both gains is taken into account"
     if exact:
         origin = exact[0].compared_with.value

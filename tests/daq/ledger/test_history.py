@@ -34,7 +34,7 @@ from daq.ledger.names import drives_of
 from daq.ledger.watch import Point, Series, alarm_text, dispersions_of, questions, watch
 from daq.report.history import COLUMNS, describe_actions
 from daq.writeback.file_access import resolve_links
-from daq.writeback.judgement import known_of
+from daq.writeback.judgement import figures_of_history
 from daq.writeback.request import GainChange
 from ident.calibration import Calibration, Gain
 from ident.drift.change import DISPERSION, dispersions
@@ -460,7 +460,7 @@ def _job_s_dispersions(cell_file: Path, own: Calibration | None = None) -> dict[
     for name in declared.axis_names:
         changes.append(GainChange(name, name, 1, 1.0, 1.0, 0.1, "Nm/A", 1.0, ""))
     target = str(resolve_links(controller))
-    known = known_of(history_of(cell_file), target, digest, changes)
+    known = figures_of_history(history_of(cell_file), target, digest, changes)
     return dict(known.dispersions)
 
 

@@ -4,12 +4,15 @@ the same numbers, or an error.
 
 from __future__ import annotations
 
+import errno
+import os
 import random
 import shutil
 import sqlite3
 import time
 from collections.abc import Callable
 from contextlib import closing, nullcontext
+from io import FileIO
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -23,6 +26,7 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 from rosbags.typesys import Stores, get_typestore
 
 from daq.cli import main
+from daq.config.foreign_files import HEAD_BYTES
 from daq.errors import (
     DataError,
     ExitCode,
@@ -164,6 +168,12 @@ MANY_TOPICS = """
     CREATE VIEW topics AS WITH RECURSIVE n(id) AS (SELECT 1 UNION ALL SELECT id + 1 FROM n)
                           SELECT id, {name} AS name, '' AS type, '' AS serialization_format FROM n;
 """
+MORE_TOPICS = """
+    WITH RECURSIVE n(id) AS (SELECT 100 UNION ALL SELECT id + 1 FROM n WHERE id < 40000)
+    INSERT INTO topics (id, name, type, serialization_format, offered_qos_profiles,
+                        type_description_hash)
+    SELECT id, '/topic_' || id, hex(zeroblob(40)), 'cdr', '', '' FROM n;
+"""
 
 
 @pytest.mark.parametrize(
@@ -187,6 +197,7 @@ MANY_TOPICS = """
         ("UPDATE messages SET data = 5", "expected a topic, nanoseconds and bytes"),
         ("UPDATE messages SET data = x'00010000'", "/joint_states with a message of 4 bytes"),
         ("UPDATE topics SET offered_qos_profiles = '" + "[" * 100_000 + "'", None),
+        (MORE_TOPICS, None),
     ],
 )
 def test_a_hostile_database_is_refused_in_bounded_time(
@@ -312,6 +323,28 @@ def test_a_packed_file_that_was_cut_before_its_first_block_is_called_that(
     path.write_bytes(packed[:length])
     with (
         pytest.raises(LogCorrupt, match="found a file that unfolds to nothing: it was cut"),
+        open_bag(path),
+    ):
+        pass
+
+
+class UnreadableFile(FileIO):
+    """A file on a disk that gives its first bytes and no more."""
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        if size is None or not 0 <= size <= HEAD_BYTES:
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        return super().read(size) or b""
+
+
+def test_a_packed_file_that_cannot_be_read_is_named_not_the_room_for_its_content(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "bag.mcap.zstd"
+    path.write_bytes(zstandard.compress(bytes(1000)))
+    monkeypatch.setattr("daq.log.bag_file.open_regular", UnreadableFile)
+    with (
+        pytest.raises(LogMissing, match=r"bag\.mcap\.zstd: found input/output error; .* zstd"),
         open_bag(path),
     ):
         pass

@@ -14,7 +14,7 @@ import pytest
 from daq.config.cell import model_of
 from daq.config.cell_file import load_cell
 from daq.errors import ConfigurationInconsistent, SchemaMismatch
-from daq.workflow.experiment import LINK_RADIUS, guessed_capsules, scene_of
+from daq.workflow.experiment import LINK_RADIUS_SHARE, guessed_capsules, scene_of
 from ident.planning.clearance import BASE
 
 CONFIGS = Path(__file__).parents[3] / "configs"
@@ -126,7 +126,7 @@ def test_links_of_a_guessed_arm_that_never_keep_the_distance_belong_together(
     reach_m = sum(float(np.linalg.norm(joint.translation_m)) for joint in others) + column_m
     short_m = 0.0
     for _ in range(30):
-        radius_m = LINK_RADIUS * (reach_m + short_m)
+        radius_m = LINK_RADIUS_SHARE * (reach_m + short_m)
         short_m = radius_m + gap_m
     above = replace(column, translation_m=np.array([0.0, 0.0, column_m]))
     beside = replace(shoulder, translation_m=np.array([0.0, 0.0, short_m]))
