@@ -167,7 +167,9 @@ class JudgedChannels:
 
 
 def faults_in_use(faults: Sequence[ChannelFault], usable: BoolArray) -> tuple[ChannelFault, ...]:
-    """Return what is wrong with samples that count.
+    """Return the faults in samples that count.
+
+    A stretch stays where each of its samples counts, and the sample before it.
 
     Args:
         faults: of all samples.
@@ -175,10 +177,12 @@ def faults_in_use(faults: Sequence[ChannelFault], usable: BoolArray) -> tuple[Ch
     """
     found: list[ChannelFault] = []
     for one in faults:
-        unused = np.cumsum(~usable[:, one.axis])
-        # A step is between two samples.
-        before = np.maximum(one.stretches[:, 0] - 2, 0)
-        is_in_use = unused[one.stretches[:, 1] - 1] == unused[before]
+        is_unused = ~usable[:, one.axis]
+        unused_before = np.concatenate(([0], np.cumsum(is_unused)))
+        # A fault is seen by the step that leads to it, from the sample before.
+        first = np.maximum(one.stretches[:, 0] - 1, 0)
+        end = one.stretches[:, 1]
+        is_in_use = unused_before[end] == unused_before[first]
         if np.any(is_in_use):
             found.append(replace(one, stretches=one.stretches[is_in_use]))
     return tuple(found)

@@ -305,6 +305,17 @@ def test_what_is_known_to_be_missing_is_no_finding() -> None:
     assert faults == ()
 
 
+def test_a_first_sample_that_is_known_to_be_missing_is_no_finding() -> None:
+    position, current = sound()
+    position[0, 1] += 1.0
+    (found,) = find_faults(position, current, RATE_HZ)
+    assert found.stretches.tolist() == [[0, 1]]
+    usable = np.ones(position.shape, dtype=np.bool_)
+    usable[0, 1] = False
+    faults = find_faults(position, current, RATE_HZ, usable=usable)
+    assert faults == ()
+
+
 # Counters, signs and places
 
 
