@@ -68,8 +68,13 @@ def refuse_unsigned(run: Run, unsigned: BoolArray, axes: Sequence[str]) -> None:
 
 
 def missing_sign(current: FloatArray) -> str:
-    """Return the sign that currents of one sign, shape (k,), do not have, in words."""
-    if current.max() > 0.0:
+    """Return the sign that currents of one sign do not have, in words.
+
+    Args:
+        current: of one axis or of several, shape (k,) or (k, c). A value of the other sign may be
+            there, of rounding or of an offset (BELOW_ZERO): the larger size decides.
+    """
+    if current.max() > -current.min():
         return "negative"
     return "positive"
 
@@ -171,8 +176,9 @@ def rise_ratio(size: FloatArray, visits: IntArray, time_s: FloatArray, rise: flo
     Returns:
         the ratio for the shortest t; infinity where the current rises too slowly.
     """
-    step_s = time_s[1] - time_s[0]
-    longest = max(round(LONGEST_RISE_S / step_s), 1)
+    # Samples that may not be used leave gaps: the first step may be one.
+    sampling_period_s = np.median(np.diff(time_s))
+    longest = max(round(LONGEST_RISE_S / sampling_period_s), 1)
     lags = np.round(np.geomspace(1.0, longest, 40)).astype(int)
     for lag in np.unique(lags).tolist():
         is_inside = (visits >= 2 * lag) & (visits < len(size) - 2 * lag)
