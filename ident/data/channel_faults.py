@@ -238,7 +238,7 @@ def _with_coupled_joints(
     turned_by = _turned_by(ratio)
     coupled = np.flatnonzero(np.count_nonzero(turned_by, axis=1) > 1).tolist()
     for joint, readings in zip(coupled, _readings(position[:, coupled], rate_hz), strict=True):
-        of_motors = [one for one in found if turned_by[joint, one.axis]]
+        of_motors = [one for one in motors if turned_by[joint, one.axis]]
         if any(one.kind is not FaultKind.DISPLACED for one in of_motors):
             continue
         others = np.delete(position, joint, axis=1)

@@ -33,6 +33,7 @@ TIME_S = np.arange(SAMPLES) / RATE_HZ
 COUNT_RAD = 2.0 * np.pi / 65536
 NOISE_A = 0.05
 COUPLED = np.array([[30.0, 0.0], [-20.0, 25.0]])
+DIFFERENTIAL = np.array([[30.0, 20.0], [30.0, -20.0]])
 TRUTH = three_axes_truth()
 
 
@@ -295,6 +296,18 @@ def test_a_frozen_encoder_of_a_coupled_joint_is_found() -> None:
     joint_rad[1500:1800, 1] = joint_rad[1500, 1]
     (found,) = find_faults(joint_rad, current, RATE_HZ, COUPLED)
     assert (found.kind, found.axis) == (FaultKind.FROZEN, 1)
+
+
+def test_frozen_encoders_of_two_joints_of_a_differential_are_both_found() -> None:
+    motor_rad, current = sound()
+    joint_rad = np.linalg.solve(DIFFERENTIAL, motor_rad.T).T
+    joint_rad[1500:1800, 0] = joint_rad[1500, 0]
+    joint_rad[3000:3300, 1] = joint_rad[3000, 1]
+    faults = find_faults(joint_rad, current, RATE_HZ, DIFFERENTIAL)
+    assert [(one.kind, one.axis) for one in faults] == [
+        (FaultKind.FROZEN, 0),
+        (FaultKind.FROZEN, 1),
+    ]
 
 
 def test_what_is_known_to_be_missing_is_no_finding() -> None:
