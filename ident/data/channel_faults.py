@@ -3,10 +3,10 @@ what is wrong with single numbers, and whether it can be mended.
 
 Arrays, native logs and imports are judged alike, each where it is read. A glitch is filled in. A
 stretch in which a channel froze, or stood at the limit of its range, is left out. Of a counter that
-wraps, a number that lost its sign, and an encoder that lost its place, nothing says what is right:
-such a recording is refused, and so is one of which too much is wrong. Held readings are
-`ident.data.held`, currents at a limit `ident.data.clipping`, currents without a sign
-`ident.data.unsigned_current`.
+wraps, a signed number that is read as an unsigned one, and an encoder that lost its place, nothing
+says what is right: such a recording is refused, and so is one of which too much is wrong. Held
+readings are in `ident.data.held`, currents at a limit in `ident.data.clipping`, and currents of
+which only the size was recorded in `ident.data.unsigned_current`.
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ from ident.data.frozen import (
     frozen_to_the_end,
     usual_step,
 )
-from ident.data.glitches import Jumps, Readings, find_jumps, is_split, smallest_change, wrap_size
+from ident.data.glitches import Jumps, Readings, find_jumps, smallest_change, upper_part, wrap_size
 from ident.data.held import fill_damaged, longest_cubic_fill, samples_to_fill
 
-LARGEST_GLITCHED = 0.01  #: Largest share of the samples of a channel that is filled in
-LARGEST_FROZEN = 0.1  #: Largest share of the samples that is left out
-LOST_PLACE = 3.0
-"""Least step of a position after which it does not return,
-in multiples of its largest usual step.
+LARGEST_GLITCHED_SHARE = 0.01  #: Largest share of the samples of a channel that is filled in
+LARGEST_FROZEN_SHARE = 0.1  #: Largest share of the samples that is left out
+LOST_PLACE_RATIO = 3.0
+"""Least step by which an encoder loses its place, as a multiple of the largest usual step of the
+position.
 """
 MOTOR_UNIT = "rad of the motor"
 JOINT_UNIT = "rad or m of the joint"
-ROUNDED_DIGITS = 12  #: Of a position that is computed of several joints, as a share of its largest
+MOTOR_ANGLE_DIGITS = 12  #: Decimals of a motor angle of several joints, in units of its largest sum
 
 
 class ChannelKind(Enum):
@@ -63,13 +63,13 @@ class ChannelFault:
 
     kind: FaultKind
     quantity: ChannelKind
-    axis: int  #: index
+    axis: int  #: index of the motor, or of the joint where the unit is JOINT_UNIT
     stretches: IntArray  #: first sample and end of each, shape (s, 2)
     #: largest distance from the course, or the range of a counter, in the unit of the channel
     size: float
     samples: int  #: of the recording
     rate_hz: float  #: of the recording
-    count: float = 0.0  #: smallest change of the channel
+    count: float = 0.0  #: smallest change that the channel can show
     unit: str = ""  #: of the channel, for messages
 
     @property
@@ -79,17 +79,18 @@ class ChannelFault:
 
     @property
     def first(self) -> int:
-        """First sample of it."""
+        """First sample that is wrong."""
         return int(self.stretches[0, 0])
 
     @property
     def is_refused(self) -> bool:
         """Whether the recording cannot be used."""
         if self.kind is FaultKind.GLITCH:
-            return self.share > LARGEST_GLITCHED
+            return self.share > LARGEST_GLITCHED_SHARE
         if self.kind is FaultKind.FROZEN:
-            return self.share > LARGEST_FROZEN
-        # What stands at the end of a range may be a joint that a simple device has stopped there.
+            return self.share > LARGEST_FROZEN_SHARE
+        # A clipped position may be that of a joint that a simple device has stopped at the end of
+        # its range. What else there is cannot be mended.
         return self.kind is not FaultKind.CLIPPED
 
     @property
@@ -119,8 +120,8 @@ def find_faults(
         rate_hz: sampling rate.
         ratio: R of the drive train, motor angles are R q (paper eq. 24), shape (n, n); None where
             each column was recorded as it is.
-        usable: samples that count, shape (k, n); what is wrong elsewhere is known, and no finding.
-            None for all.
+        usable: samples that count, shape (k, n); faults elsewhere are known, and not returned.
+            None where every sample counts.
         unit: of the columns of positions, for messages.
 
     Returns:
@@ -138,7 +139,7 @@ def find_faults(
         place = ChannelPlace(ChannelKind.POSITION, axis, samples, unit)
         found += _position_faults(readings, others, place)
     if ratio is not None:
-        found = _with_joints(found, position, ratio, rate_hz)
+        found = _with_coupled_joints(found, position, ratio, rate_hz)
     for axis, readings in enumerate(_readings(current, rate_hz)):
         place = ChannelPlace(ChannelKind.CURRENT, axis, samples)
         found += _current_faults(readings, recorded[:, axis], place)
@@ -167,7 +168,9 @@ class JudgedChannels:
 
 
 def faults_in_use(faults: Sequence[ChannelFault], usable: BoolArray) -> tuple[ChannelFault, ...]:
-    """Return what is wrong with samples that count.
+    """Return the faults in samples that count.
+
+    A stretch stays where each of its samples counts, and the sample before it.
 
     Args:
         faults: of all samples.
@@ -175,18 +178,21 @@ def faults_in_use(faults: Sequence[ChannelFault], usable: BoolArray) -> tuple[Ch
     """
     found: list[ChannelFault] = []
     for one in faults:
-        unused = np.cumsum(~usable[:, one.axis])
-        # A step is between two samples.
-        before = np.maximum(one.stretches[:, 0] - 2, 0)
-        is_in_use = unused[one.stretches[:, 1] - 1] == unused[before]
+        is_unused = ~usable[:, one.axis]
+        unused_before = np.concatenate(([0], np.cumsum(is_unused)))
+        # A fault is seen by the step that leads to it, from the sample before.
+        first = np.maximum(one.stretches[:, 0] - 1, 0)
+        end = one.stretches[:, 1]
+        is_in_use = unused_before[end] == unused_before[first]
         if np.any(is_in_use):
             found.append(replace(one, stretches=one.stretches[is_in_use]))
     return tuple(found)
 
 
 def motor_positions(position: FloatArray, ratio: FloatArray) -> FloatArray:
-    """Return what the encoders of the motors have read, shape (k, n):
-    a number that repeats repeats exactly.
+    """Return what the encoders of the motors have read, shape (k, n).
+
+    A reading that repeats does so exactly, also where it is computed of several joints.
 
     Args:
         position: of the joints, shape (k, n).
@@ -201,24 +207,26 @@ def motor_positions(position: FloatArray, ratio: FloatArray) -> FloatArray:
         largest = float(np.max(np.abs(of_joints) @ np.abs(ratios)))
         if len(joints) > 1 and largest > 0.0:
             # The sum over joints has rounding errors, with which nothing would repeat.
-            turned = np.round(turned / largest, ROUNDED_DIGITS) * largest
+            turned = np.round(turned / largest, MOTOR_ANGLE_DIGITS) * largest
         motor_rad[:, motor] = turned
     return motor_rad
 
 
 def _turned_by(ratio: FloatArray) -> BoolArray:
-    """Whether each motor turns each joint, joints first, shape (n, n)."""
-    size = np.abs(np.linalg.inv(ratio))
-    return np.asarray(size > 1e-12 * size.max(), dtype=np.bool_)
+    """Whether a joint (row) is turned by a motor (column), shape (n, n): q_joint = R⁻¹ q_motor."""
+    share_of_motor = np.abs(np.linalg.inv(ratio))
+    rounding = 1e-12 * share_of_motor.max()
+    return np.asarray(share_of_motor > rounding, dtype=np.bool_)
 
 
-def _with_joints(
+def _with_coupled_joints(
     motors: Sequence[ChannelFault], position: FloatArray, ratio: FloatArray, rate_hz: float
 ) -> list[ChannelFault]:
-    """Add the faults of joints that several motors turn, whose own encoders may have been read.
+    """Add the faults of joints that several motors turn: their encoders may be at the joints.
 
-    A joint is judged where nothing is wrong with its motors but steps: those of a frozen joint are
-    in each of them.
+    A joint is judged where its motors have no fault, or are only displaced. The position of a joint
+    that freezes and goes on steps, and so do those of its motors. Where the joint is found frozen
+    or clipped, its fault takes the place of the motors' steps.
 
     Args:
         motors: faults of the positions of the motors.
@@ -230,16 +238,16 @@ def _with_joints(
     turned_by = _turned_by(ratio)
     coupled = np.flatnonzero(np.count_nonzero(turned_by, axis=1) > 1).tolist()
     for joint, readings in zip(coupled, _readings(position[:, coupled], rate_hz), strict=True):
-        own = [one for one in found if turned_by[joint, one.axis]]
-        if any(one.kind is not FaultKind.DISPLACED for one in own):
+        of_motors = [one for one in motors if turned_by[joint, one.axis]]
+        if any(one.kind is not FaultKind.DISPLACED for one in of_motors):
             continue
         others = np.delete(position, joint, axis=1)
         place = ChannelPlace(ChannelKind.POSITION, joint, len(position), JOINT_UNIT)
         faults = list(_position_faults(readings, others, place))
         has_left_out = any(one.is_left_out for one in faults)
         if has_left_out:
-            found = [one for one in found if one not in own]
-        if has_left_out or not own:
+            found = [one for one in found if one not in of_motors]
+        if has_left_out or not of_motors:
             found += faults
     return found
 
@@ -287,7 +295,9 @@ def replaced_samples(
             continue
         columns = np.array([one.axis])
         if turned_by is not None:
-            columns = np.union1d(columns, np.flatnonzero(turned_by[:, one.axis]))
+            # The axis is that of a motor, or of a joint whose own encoder was read.
+            joints_of_motor = np.flatnonzero(turned_by[:, one.axis])
+            columns = np.union1d(columns, joints_of_motor)
         for first, end in one.stretches.tolist():
             marked[first:end, columns] = True
     return marked
@@ -302,7 +312,7 @@ def mended(
     time: FloatArray | None = None,
 ) -> FloatArray:
     """Return channels, shape (k, n), with the samples replaced that are no readings;
-    the same array without any.
+    the same array where there are none.
 
     Args:
         values: positions or currents, as of `find_faults`.
@@ -319,8 +329,9 @@ def mended(
     if quantity is ChannelKind.POSITION:
         longest_cubic = longest_cubic_fill(rate_hz)
     columns: list[FloatArray] = []
-    for own, wrong in zip(values.T, replaced.T, strict=True):
-        columns.append(fill_damaged(own, wrong, longest_cubic, time))
+    for channel, is_replaced in zip(values.T, replaced.T, strict=True):
+        filled = fill_damaged(channel, is_replaced, longest_cubic, time)
+        columns.append(filled)
     return np.stack(columns, axis=1)
 
 
@@ -335,7 +346,7 @@ def left_out_samples(
     Args:
         faults: of the recording.
         shape: of its positions.
-        margin: samples before and after those of a position.
+        margin: samples that are left out before and after the fault of a position.
     """
     out = np.zeros(shape, dtype=np.bool_)
     for one in faults:
@@ -352,7 +363,7 @@ def left_out_samples(
 
 @dataclass(frozen=True, slots=True)
 class ChannelPlace:
-    """A channel of a recording."""
+    """Which channel of a recording is judged."""
 
     quantity: ChannelKind
     axis: int  #: index
@@ -377,9 +388,9 @@ class ChannelPlace:
 
 
 def _readings(channels: FloatArray, rate_hz: float) -> Iterator[Readings]:
-    """Yield the readings of each channel, shape (k, c), without those that were held.
+    """Yield the readings of each channel, shape (k, c), without samples that only hold one.
 
-    A channel that hardly changes is taken to be as fine as the coarsest of the others.
+    Where a channel changes too seldom to show its count, the coarsest count of the others is taken.
     """
     counts = [smallest_change(values) for values in channels.T]
     coarsest = 0.0
@@ -401,7 +412,13 @@ def _readings(channels: FloatArray, rate_hz: float) -> Iterator[Readings]:
 def _position_faults(
     readings: Readings, others: FloatArray, place: ChannelPlace
 ) -> Iterator[ChannelFault]:
-    """Judge a position, given those of the other columns, shape (k, n − 1)."""
+    """Judge a position.
+
+    Args:
+        readings: of the position.
+        others: positions of the other columns, shape (k, n − 1).
+        place: which channel it is.
+    """
     jumps = find_jumps(readings, is_position=True)
     counter_range = wrap_size(readings, jumps, is_position=True)
     if counter_range is not None:
@@ -410,11 +427,11 @@ def _position_faults(
         return
     if jumps.glitches:
         stretches = _glitched(readings, jumps)
-        yield place.fault(FaultKind.GLITCH, readings, stretches, _largest(jumps))
+        yield place.fault(FaultKind.GLITCH, readings, stretches, _largest_glitch(jumps))
     without_glitches = _without(readings, jumps)
-    frozen = np.concatenate(
-        (frozen_position(without_glitches), frozen_to_the_end(without_glitches, others))
-    )
+    frozen_within = frozen_position(without_glitches)
+    frozen_at_end = frozen_to_the_end(without_glitches, others)
+    frozen = np.concatenate((frozen_within, frozen_at_end))
     if len(frozen):
         yield place.fault(FaultKind.FROZEN, readings, frozen)
     else:
@@ -432,22 +449,31 @@ def _lost_place(readings: Readings, jumps: Jumps, frozen: IntArray) -> BoolArray
     """Steps after which a position goes on displaced, shape (s,),
     without those at the ends of frozen stretches.
     """
-    is_large = np.abs(jumps.step_size) > LOST_PLACE * usual_step(readings)
+    is_large = np.abs(jumps.step_size) > LOST_PLACE_RATIO * usual_step(readings)
+    # The end of a stretch is the sample after its last one.
     leaves_frozen = np.isin(readings.sample[jumps.step] + 1, frozen)
     enters_frozen = np.isin(readings.sample[jumps.step + 1], frozen)
-    return np.asarray(is_large & ~(leaves_frozen | enters_frozen))
+    is_end_of_frozen = leaves_frozen | enters_frozen
+    return np.asarray(is_large & ~is_end_of_frozen)
 
 
 def _current_faults(
     readings: Readings, motor_rad: FloatArray, place: ChannelPlace
 ) -> Iterator[ChannelFault]:
-    """Judge the current of a motor, given its positions, shape (k,)."""
-    upper = is_split(readings.values)
+    """Judge the current of a motor.
+
+    Args:
+        readings: of the current.
+        motor_rad: positions of the motor at every sample, shape (k,).
+        place: which channel it is.
+    """
+    upper = upper_part(readings.values)
     if upper is not None:
         step = np.flatnonzero(np.diff(upper))
-        sizes = np.abs(np.diff(readings.values)[step])
+        changes = np.diff(readings.values)
+        size = float(np.median(np.abs(changes[step])))
         stretches = _steps(readings, step)
-        yield place.fault(FaultKind.UNSIGNED, readings, stretches, float(np.median(sizes)))
+        yield place.fault(FaultKind.UNSIGNED, readings, stretches, size)
         return
     jumps = find_jumps(readings, is_position=False)
     counter_range = wrap_size(readings, jumps, is_position=False)
@@ -457,8 +483,9 @@ def _current_faults(
         return
     if jumps.glitches:
         stretches = _glitched(readings, jumps)
-        yield place.fault(FaultKind.GLITCH, readings, stretches, _largest(jumps))
-    frozen = frozen_current(_without(readings, jumps), motor_rad)
+        yield place.fault(FaultKind.GLITCH, readings, stretches, _largest_glitch(jumps))
+    without_glitches = _without(readings, jumps)
+    frozen = frozen_current(without_glitches, motor_rad)
     if len(frozen):
         yield place.fault(FaultKind.FROZEN, readings, frozen)
 
@@ -471,13 +498,18 @@ def _glitched(readings: Readings, jumps: Jumps) -> IntArray:
     return np.column_stack((samples[first], samples[end]))
 
 
-def _largest(jumps: Jumps) -> float:
+def _largest_glitch(jumps: Jumps) -> float:
     """Largest distance of a glitch from the course."""
     return max(one.size for one in jumps.glitches)
 
 
 def _steps(readings: Readings, step: IntArray) -> IntArray:
-    """The sample after each step, as a stretch."""
+    """The sample after each step, as a stretch, shape (s, 2).
+
+    Args:
+        readings: of the channel.
+        step: number of the reading before each step, shape (s,).
+    """
     after = readings.sample[step + 1]
     return np.column_stack((after, after + 1))
 

@@ -34,17 +34,17 @@ REST_SPEEDS = (0.01, 0.03, 0.1)
 Each is tried, until WELL_FOLLOWED is reached; the trapezoids that follow the motion best are used.
 A low limit misses rests of a disturbed motor, a high one takes slow moves for rests.
 """
-#: Shortest rest, and the window of the mean speed that shows it
-SHORTEST_REST_S = 0.05
+SHORTEST_REST_S = 0.05  #: Shortest rest, and the window over which the speed is a mean
 #: Shortest distance between two rests, as a share of the motor's range. Rests that are closer are
 #: one: between them the motor settles, or the disturbance moves it.
-SHORTEST_MOVE = 0.01
+SHORTEST_MOVE_SHARE = 0.01
 #: Samples of each move that its fit uses: about twenty for each unknown
 FIT_SAMPLES = 64
 FIT_ITERATIONS = 25
-#: Moves are split until there are so many stops for each rest: continuous motion has no end of them
+#: Largest number of stops for each rest, at which moves are split no further: a continuous motion
+#: would be split without end
 MAX_STOPS_PER_REST = 4
-#: Share of a motor's squared velocity that its trapezoids follow where every move was found
+#: Share of a motor's squared velocity that its trapezoids follow where every rest was found
 WELL_FOLLOWED = 0.98
 LEAST_FOLLOWED = 0.9
 """Least share of a motor's squared velocity that its trapezoids must follow.
@@ -143,7 +143,7 @@ def demanded_positions(data: Dataset, drive_train: DriveTrain) -> FloatArray | N
         demanded positions of the joints [rad; m for a prismatic joint], shape (k, n), delayed like
         the recorded ones; None where the motion of a motor is not made of trapezoids between rests.
     """
-    # q_motor = R q_joint, each row in units of the motor's own joint
+    # q_motor = R q_joint, each row divided by the motor's reduction N
     recorded = drive_train.direction @ data.position_rad.T
     demanded = recorded.copy()
     for motor, position in enumerate(recorded):
@@ -156,8 +156,8 @@ def demanded_positions(data: Dataset, drive_train: DriveTrain) -> FloatArray | N
                 misfit = trial_misfit
             if misfit <= 1.0 - WELL_FOLLOWED:
                 break
-        moves = data.motor_moving[:, motor].any()
-        if moves and misfit > 1.0 - LEAST_FOLLOWED:
+        is_moved = data.motor_moving[:, motor].any()
+        if is_moved and misfit > 1.0 - LEAST_FOLLOWED:
             return None
     joint_positions = np.linalg.solve(drive_train.direction, demanded)
     return np.asarray(joint_positions.T)
@@ -201,9 +201,11 @@ def _trapezoids(position: FloatArray, rate_hz: float, rest_speed: float) -> Floa
     """
     # A disturbed motor never stands still: its speed is a mean over SHORTEST_REST_S.
     half_window = max(1, round(0.5 * SHORTEST_REST_S * rate_hz))
+    shortest_rest = 2 * half_window
     speed = _mean_speed(position, half_window)
     rest_limit = rest_speed * float(np.quantile(speed, 0.95))
-    rests = _rests(position, speed <= rest_limit, 2 * half_window)
+    is_slow = speed <= rest_limit
+    rests = _rests(position, is_slow, shortest_rest)
     stops = [rest.middle for rest in rests]
     while True:
         demanded = _motion_between(position, stops, rate_hz)
@@ -241,7 +243,7 @@ def _missed_stop(
     end: _Stop,
     half_window: int,
 ) -> _Stop | None:
-    """A stop within a move that no trapezoid follows; None where there is none.
+    """A stop within a move that its trapezoid does not follow; None where there is none.
 
     Such a move is two moves, and the disturbance hides the rest between them. The stop is where the
     motor is slowest, apart from the first and the last tenth of the move.
@@ -249,13 +251,16 @@ def _missed_stop(
     Args:
         position: of the motor, shape (k,).
         demanded: by trapezoids between the stops that are known, shape (k,).
-        speed: of the motor, a mean over so many samples on either side as half_window, shape (k,).
+        speed: of the motor, a mean over half_window samples on either side, shape (k,).
         start, end: stops between which the move is.
-        half_window: a move whose tenth is not longer is not divided.
+        half_window: in samples; a move is not divided where its tenth is no longer than that.
     """
     move = slice(start.sample, end.sample)
     tenth = (end.sample - start.sample) // 10
-    if tenth <= half_window or _misfit(position[move], demanded[move]) <= 1.0 - LEAST_FOLLOWED:
+    if tenth <= half_window:
+        return None
+    misfit = _misfit(position[move], demanded[move])
+    if misfit <= 1.0 - LEAST_FOLLOWED:
         return None
     first = start.sample + tenth
     last = end.sample - tenth
@@ -286,11 +291,16 @@ def _mean_speed(position: FloatArray, half_window: int) -> FloatArray:
 
 
 def _misfit(position: FloatArray, demanded: FloatArray) -> float:
-    """Share of the squared velocity that a demanded motion does not follow."""
+    """Share of the squared velocity that a demanded motion does not follow.
+
+    Args:
+        position: of the motor, shape (k,).
+        demanded: by trapezoids, shape (k,).
+    """
     velocity = np.diff(position)
     error = velocity - np.diff(demanded)
-    square = max(float(velocity @ velocity), SMALLEST_SQUARE)
-    return float(np.sum(error**2) / square)
+    squared_velocity = max(float(velocity @ velocity), SMALLEST_SQUARE)
+    return float(np.sum(error**2) / squared_velocity)
 
 
 def _rests(position: FloatArray, is_slow: BoolArray, shortest: int) -> list[_Rest]:
@@ -301,7 +311,7 @@ def _rests(position: FloatArray, is_slow: BoolArray, shortest: int) -> list[_Res
     Args:
         position: of the motor, shape (k,).
         is_slow: whether it is slower than the limit of a rest, shape (k,).
-        shortest: samples of the shortest rest.
+        shortest: length of the shortest rest, in samples.
     """
     stretches: list[tuple[int, int]] = []
     for first, end in true_stretches(is_slow):
@@ -312,7 +322,7 @@ def _rests(position: FloatArray, is_slow: BoolArray, shortest: int) -> list[_Res
         stretches.insert(0, (0, 1))
     if stretches[-1][1] < count:
         stretches.append((count - 1, count))
-    shortest_move = SHORTEST_MOVE * float(np.ptp(position))
+    shortest_move = SHORTEST_MOVE_SHARE * float(np.ptp(position))
     rests: list[_Rest] = []
     for first, end in stretches:
         rest = _Rest(first, end, float(np.median(position[first:end])))
@@ -329,12 +339,12 @@ def _fit_moves(position: FloatArray, stops: Sequence[_Stop], rate_hz: float) -> 
     Returns:
         start, ramp and duration [s] of each move, shape (m, 3).
     """
-    spacing = np.linspace(0.0, 1.0, FIT_SAMPLES)
+    share_of_time = np.linspace(0.0, 1.0, FIT_SAMPLES)
     times_s: list[FloatArray] = []
     shares: list[FloatArray] = []
     for start, end in pairwise(stops):
         last = end.sample - 1 - start.sample
-        samples = np.rint(spacing * last).astype(np.int64)
+        samples = np.rint(share_of_time * last).astype(np.int64)
         travelled = position[start.sample + samples] - start.position
         times_s.append(samples / rate_hz)
         shares.append(travelled / (end.position - start.position))
@@ -367,8 +377,8 @@ def _fit_trapezoids(time_s: FloatArray, share: FloatArray) -> FloatArray:
         # (JᵀJ + (λ tr JᵀJ + ε) 1) Δ = Jᵀ r of each move
         gram = transposed @ jacobian
         trace = np.trace(gram, axis1=1, axis2=2)
-        diagonal = damping[:, None] * trace[:, None] + 1e-12
-        gram += diagonal[:, :, None] * np.eye(3)
+        added = damping[:, None] * trace[:, None] + 1e-12
+        gram += added[:, :, None] * np.eye(3)
         change = np.linalg.solve(gram, transposed @ residual[:, :, None])
         trial = parameters + change[:, :, 0]
         # A ramp is not zero, and two ramps fit in the duration.
@@ -395,9 +405,9 @@ def _share_jacobian(time_s: FloatArray, parameters: FloatArray, share: FloatArra
     """
     duration = parameters[:, 2]
     changed_shares: list[FloatArray] = []
-    for direction in np.eye(3):
-        relative_change = DERIVATIVE_STEP * direction
-        changed = parameters + relative_change * duration[:, None]
+    for parameter in np.eye(3):
+        share_of_duration = DERIVATIVE_STEP * parameter
+        changed = parameters + share_of_duration * duration[:, None]
         changed_shares.append(_distance_share(time_s, changed))
     step = DERIVATIVE_STEP * duration
     difference = np.stack(changed_shares, axis=2) - share[:, :, None]

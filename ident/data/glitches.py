@@ -18,45 +18,58 @@ import numpy as np
 from ident.arrays import BoolArray, FloatArray, IntArray
 from ident.data.held import ROUNDING
 
-SUSPECT = 10.0
-"""A step is looked at whose change is so many times a percentile of the changes of a channel."""
+SUSPECT_RATIO = 10.0
+"""Least change from one step to the next at a step that may be a jump,
+as a multiple of a percentile of these changes.
+"""
 POSITION_PERCENTILE = 90.0  #: That percentile of a position, which is smooth at any time
 CURRENT_PERCENTILE = 98.0
 """That percentile of a current.
 
-A controller may ask for one that lasts a sample: where a joint breaks loose, those of a real robot
-have up to 12 times the percentile, and ring on.
+A controller may ask for a current that lasts one sample: where a joint breaks loose, those of a
+real robot have up to 12 times the percentile, and ring on.
 """
-JUMP = 10.0
-"""A jump differs from the steps around it by so many times their spread.
+JUMP_RATIO = 10.0
+"""Least difference of a jump from the steps around it, as a multiple of their spread.
 
-Noise that is normal reaches 5 times.
+Normal noise reaches 5 times.
 """
 SPREAD_PERCENTILE = 80.0
-"""Percentile of the distances of the steps around from their median: a current that goes up and
-down with friction has many small ones among its large ones; two other glitches may be near.
-"""
-JUMP_COUNTS = 20.0  #: And by so many counts: an encoder at rest may flicker
-#: Of a channel that shows its counts: those of an axis at rest may be glitches alone
-LEAST_CHANGES = 20
-NEAR = 5  #: Nearest step around a jump that is compared with it, on either side
-FAR = 14  #: Farthest one
-SHORT = 3  #: Readings that a glitch of any shape may have
-#: Of a glitch whose readings follow the channel, or repeat one number: a position, or a dropout
-LONGEST_S = 0.05
-USUAL_PERCENTILES = 1.0, 99.0
-"""Their distance is the usual range of a current.
+"""Percentile that is the spread of the steps around a jump, of their distances from their median.
 
-A short glitch of a current is larger: what a controller asks for where a joint breaks loose may
-last one reading, and nothing tells it from a smaller glitch, which bends no gain.
+A current that goes up and down with friction has many small steps among its large ones, and two
+other glitches may be near.
 """
-RETURN = 0.25  #: Largest distance from its course after a glitch, as a share of the glitch
-RETURNED = 2  #: Readings after it that are on the course; what rings on is a blow to the robot
-SAME_SIZE = 0.05  #: Largest relative difference of the steps of a counter that wraps
-#: Beginning of the part of a range that is empty where negative numbers lost their sign
-EMPTY_FROM = 0.25
-EMPTY_TO = 0.75  #: End of that part
-LEAST_SPLIT = 0.01  #: Least share of the values at either end of it
+#: Counts by which a jump differs from the steps around it beyond their spread: an encoder at rest
+#: may flicker
+JUMP_COUNTS = 20.0
+#: Fewest changes that show the count of a channel: those of an axis at rest may all be glitches
+LEAST_CHANGES = 20
+NEAREST_STEP = 5  #: Steps from a jump to the nearest one that it is compared with, on either side
+FARTHEST_STEP = 14  #: Steps to the farthest one
+SHORT_READINGS = 3  #: Longest glitch of any shape, in readings
+LONGEST_GLITCH_S = 0.05
+"""Longest glitch of a position, which is continuous,
+and longest dropout of a current, which repeats one number.
+"""
+USUAL_PERCENTILES = 1.0, 99.0
+"""Percentiles of a current between which its usual range is.
+
+A short glitch of a current is larger than that range. A controller may ask for a smaller current
+that lasts one reading, where a joint breaks loose: nothing tells it from a smaller glitch, which
+bends no gain.
+"""
+RETURN_SHARE = 0.25  #: Largest distance from its course after a glitch, as a share of the glitch
+#: Readings after a glitch that must be on the course; what rings on is a blow to the robot
+RETURNED_READINGS = 2
+SIZE_TOLERANCE = 0.05  #: Largest relative difference of the steps of a counter that wraps
+MIDDLE_FROM = 0.25
+"""Beginning of the middle of a range, as a share of it.
+
+The middle is empty where negative numbers lost their sign; a counter that wraps goes through it.
+"""
+MIDDLE_TO = 0.75  #: End of that middle
+LEAST_PART_SHARE = 0.01  #: Least share of the values in a part of a range that is not empty
 WRAP_SHARE = 0.75  #: Least share of the range of a counter that was seen where it wraps
 
 
@@ -86,11 +99,11 @@ def smallest_change(values: FloatArray) -> float | None:
 
 @dataclass(frozen=True, slots=True)
 class Glitch:
-    """Readings that are none."""
+    """Successive readings that do not show what the channel measures."""
 
     first: int  #: number of the first reading
-    end: int  #: of the next one that is right
-    size: float  #: distance from the course
+    end: int  #: number of the next reading that is right
+    size: float  #: size of the jump that begins it, in the unit of the channel
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -118,7 +131,7 @@ def find_jumps(readings: Readings, *, is_position: bool) -> Jumps:
         lowest, highest = np.percentile(readings.values, USUAL_PERCENTILES)
         smallest = float(highest - lowest)
     step, size = _jumps(readings, percentile)
-    longest = max(SHORT, round(LONGEST_S * readings.rate_hz))
+    longest = max(SHORT_READINGS, round(LONGEST_GLITCH_S * readings.rate_hz))
     glitches: list[Glitch] = []
     others: list[int] = []
     number = 0
@@ -139,21 +152,22 @@ def find_jumps(readings: Readings, *, is_position: bool) -> Jumps:
 def wrap_size(readings: Readings, jumps: Jumps, *, is_position: bool) -> float | None:
     """Range of a counter that wraps, in the unit of the channel; None where none does.
 
-    It goes on one range away, again and again, and never leaves that range.
+    At a wrap the channel goes on one range away. It wraps again and again, and never leaves its
+    range.
     """
     if not len(jumps.step):
         return None
     sizes = _sizes_of_wraps(readings, jumps.step)
     counter_range = float(np.median(sizes))
     seen_range = float(np.ptp(readings.values))
-    if not WRAP_SHARE * counter_range <= seen_range <= (1.0 + SAME_SIZE) * counter_range:
+    if not WRAP_SHARE * counter_range <= seen_range <= (1.0 + SIZE_TOLERANCE) * counter_range:
         return None
     # A counter goes through its range; a current that friction turns between two values does not.
-    if not is_position and _share_in_middle(readings.values) < LEAST_SPLIT:
+    if not is_position and _share_in_middle(readings.values) < LEAST_PART_SHARE:
         return None
-    is_same = np.abs(sizes - counter_range) <= SAME_SIZE * counter_range
+    is_wrap = np.abs(sizes - counter_range) <= SIZE_TOLERANCE * counter_range
     # A single step may be that of an encoder that has lost its place.
-    if np.count_nonzero(is_same) < 2 or np.mean(is_same) <= 0.5:
+    if np.count_nonzero(is_wrap) < 2 or np.mean(is_wrap) <= 0.5:
         return None
     return counter_range
 
@@ -164,50 +178,60 @@ def _share_in_middle(values: FloatArray) -> float:
     range_ = float(np.ptp(values))
     if not range_ > 0.0:
         return 0.0
-    place = (values - lowest) / range_
-    is_in_middle = (place > EMPTY_FROM) & (place < EMPTY_TO)
+    share_of_range = (values - lowest) / range_
+    is_in_middle = (share_of_range > MIDDLE_FROM) & (share_of_range < MIDDLE_TO)
     return float(np.mean(is_in_middle))
 
 
 def _sizes_of_wraps(readings: Readings, step: IntArray) -> FloatArray:
     """Size of each step less the motion, by the two steps on either side of it, shape (s,)."""
     steps = np.diff(readings.values)
-    around = np.clip(step[:, None] + np.array([-2, -1, 1, 2]), 0, len(steps) - 1)
-    motion = np.median(steps[around], axis=1)
+    neighbours = step[:, None] + np.array([-2, -1, 1, 2])
+    inside = np.clip(neighbours, 0, len(steps) - 1)
+    motion = np.median(steps[inside], axis=1)
     return np.asarray(np.abs(steps[step] - motion))
 
 
 def _jumps(readings: Readings, percentile: float) -> tuple[IntArray, FloatArray]:
-    """Steps unlike those around them, by the number of the reading before,
-    and their sizes less the motion.
+    """Find steps unlike those around them.
+
+    Args:
+        readings: of the channel.
+        percentile: of the changes from step to step; SUSPECT_RATIO is a multiple of it.
+
+    Returns:
+        number of the reading before each of them, and their sizes less the motion.
     """
     no_jumps = (np.zeros(0, dtype=np.int64), np.zeros(0))
     steps = np.diff(readings.values)
     count = len(steps)
-    if count < 2 * FAR:
+    if count < 2 * FARTHEST_STEP:
         return no_jumps
     suspects = _suspect_steps(steps, float(np.ptp(readings.values)), percentile)
     if not len(suspects):
         return no_jumps
-    before = np.arange(-FAR, -NEAR + 1)
-    after = np.arange(NEAR, FAR + 1)
+    before = np.arange(-FARTHEST_STEP, -NEAREST_STEP + 1)
+    after = np.arange(NEAREST_STEP, FARTHEST_STEP + 1)
     indices = suspects[:, None] + np.concatenate((before, after))
     is_outside = (indices < 0) | (indices >= count)
-    around = np.where(is_outside, np.nan, steps[np.clip(indices, 0, count - 1)])
+    inside = np.clip(indices, 0, count - 1)
+    around = np.where(is_outside, np.nan, steps[inside])
     motion = np.nanmedian(around, axis=1)
     distances = np.abs(around - motion[:, None])
     spread = np.nanpercentile(distances, SPREAD_PERCENTILE, axis=1)
     size = steps[suspects] - motion
-    smallest = JUMP * spread + JUMP_COUNTS * readings.count
-    is_jump = np.abs(size) > smallest
+    smallest_jump = JUMP_RATIO * spread + JUMP_COUNTS * readings.count
+    is_jump = np.abs(size) > smallest_jump
     return suspects[is_jump], size[is_jump]
 
 
 def _suspect_steps(steps: FloatArray, range_: float, percentile: float) -> IntArray:
-    """Indices of steps whose change is large, and of those of half the range of the channel."""
+    """Indices of steps next to a large change of step, and of those above half the range of the
+    channel.
+    """
     changes = np.abs(np.diff(steps))
-    smallest = SUSPECT * float(np.percentile(changes, percentile))
-    is_large = changes > max(smallest, ROUNDING * range_)
+    smallest_change_of_step = SUSPECT_RATIO * float(np.percentile(changes, percentile))
+    is_large = changes > max(smallest_change_of_step, ROUNDING * range_)
     is_suspect = np.zeros(len(steps), dtype=np.bool_)
     is_suspect[1:] |= is_large
     is_suspect[:-1] |= is_large
@@ -231,8 +255,8 @@ def _glitch_from(
     Args:
         readings: of the channel.
         step, size: of the jumps that are left, as of `_jumps`.
-        longest: glitch, in samples.
-        smallest: size of a glitch of SHORT readings or fewer.
+        longest: length of the longest glitch, in samples.
+        smallest: size that a glitch of SHORT_READINGS or fewer exceeds.
         is_position: as of `find_jumps`.
     """
     values = readings.values
@@ -242,37 +266,38 @@ def _glitch_from(
     signed_size = float(size[0])
     glitch_size = abs(signed_size)
     motion = float(values[first] - values[begin]) - signed_size
-    # A current steps where friction turns; one that does so near an end of the recording need not
-    # return.
     is_alone = len(step) == 1 or step[1] - begin > longest
-    if is_position and begin < SHORT and is_alone:
+    # Near an end of the recording, a position need not return to its course. A current that steps
+    # there may be friction that turns.
+    if is_position and begin < SHORT_READINGS and is_alone:
         return Glitch(0, first, glitch_size), 1
     for number in range(1, len(step)):
         last = int(step[number])
         samples = int(readings.sample[last] - readings.sample[begin])
         if samples > longest:
             break
-        after = np.arange(last + 1, min(last + 1 + RETURNED, count))
+        after = np.arange(last + 1, min(last + 1 + RETURNED_READINGS, count))
+        # The course goes on from the reading before the glitch, with the motion around it.
         off_course = values[after] - values[begin] - motion * (after - begin)
-        if np.max(np.abs(off_course)) > RETURN * glitch_size:
+        if np.max(np.abs(off_course)) > RETURN_SHARE * glitch_size:
             continue
         inside = values[first : last + 1]
-        is_short = samples <= SHORT and glitch_size > smallest
-        is_dropout = samples > SHORT and np.ptp(inside) == 0.0
+        is_short = samples <= SHORT_READINGS and glitch_size > smallest
+        is_dropout = samples > SHORT_READINGS and np.ptp(inside) == 0.0
         if is_position or is_short or is_dropout:
             return Glitch(first, last + 1, glitch_size), number + 1
-    if is_position and count - 1 - begin <= SHORT:
+    if is_position and count - 1 - begin <= SHORT_READINGS:
         return Glitch(first, count, glitch_size), len(step)
     return None
 
 
-def is_split(values: FloatArray) -> BoolArray | None:
+def upper_part(values: FloatArray) -> BoolArray | None:
     """Whether each value is in the upper part of a range whose middle is empty, shape (k,);
-    None where it is not.
+    None where there is no such range.
 
-    A signed number that is read without its sign has its negative values at the other end of the
-    counter's range, and all have one sign: a current that friction alone turns between two values
-    has both.
+    Where a signed number is read as an unsigned one, its negative values are at the other end of
+    the counter's range, so all of its values have one sign. A current that friction alone turns
+    between two values has both signs.
     """
     lowest = float(values.min())
     if lowest < 0.0 < float(values.max()):
@@ -284,7 +309,7 @@ def is_split(values: FloatArray) -> BoolArray | None:
     is_empty = _share_in_middle(values) == 0.0
     crossings = int(np.count_nonzero(np.diff(upper)))
     share = float(np.mean(upper))
-    is_both = min(share, 1.0 - share) >= LEAST_SPLIT
-    if is_empty and is_both and crossings >= 2:
+    are_both_used = min(share, 1.0 - share) >= LEAST_PART_SHARE
+    if is_empty and are_both_used and crossings >= 2:
         return upper
     return None

@@ -16,29 +16,37 @@ from ident.arrays import BoolArray, FloatArray, IntArray
 from ident.data.run import Run
 from ident.errors import CurrentUnsigned
 
-USUAL_PERCENTILE = 99.0  #: Of the sizes of a current; what follows is a share of it
-NEAR_ZERO = 0.02  #: Current of a visit to zero
-BELOW_ZERO = 0.005  #: Largest current of the other sign: of rounding, or of an offset
-VISITS = 6
+USUAL_PERCENTILE = 99.0  #: Percentile of the sizes of a current that is its usual largest size
+VISIT_SHARE = 0.02  #: Largest size in a visit to zero, as a share of the usual largest one
+#: Largest size of the other sign, by rounding or an offset, as a share of the usual largest one
+OTHER_SIGN_SHARE = 0.005
+LEAST_VISITS = 6
 """Least visits of a run to zero.
 
 The sizes of the currents of two real robots and a simulated one make 6 to 37 in 9 to 40 s; the same
 currents with a sign, shifted until they have one sign alone, make 4 at most.
 """
-COARSE = 0.05  #: Largest share that one count is of a current that needs VISITS
-#: Least visits of a coarser current: rounding takes others to zero, up to 6 times
-COARSE_VISITS = 12
-APART_S = 0.1  #: Two visits are at least so far apart
-REST_S = 0.05  #: A value that stays so long is a brake's, or of a drive without power, and no visit
-BOUNCE = 3.0
+#: Smallest count of a coarse current, as a share of its usual largest size
+COARSE_COUNT_SHARE = 0.05
+#: Least visits of a coarse current: rounding takes one that has its sign to zero, up to 6 times
+LEAST_COARSE_VISITS = 12
+LEAST_PAUSE_S = 0.1  #: Least time between two visits
+LONGEST_VISIT_S = 0.05
+"""Longest time for which the current keeps one value in a visit.
+
+A longer one is no visit: the brake is on, or the drive has no power.
+"""
+LARGEST_RISE_RATIO = 3.0
 """Largest rise after a visit over the time 2 t, relative to that over t.
 
 A size bounces with the ratio 2 and less; a smooth current that comes near zero by chance turns as a
 parabola, with 4.
 """
-RISE = 0.1  #: Rise over the time t
+#: Least rise over the time t, as a share of the usual largest size
+RISE_SHARE = 0.1
 LONGEST_RISE_S = 0.3  #: Largest t
-EACH_WAY = 0.1  #: Least share of the way of a motor in each direction
+#: Least way in each direction of a motor that turns both ways, as a share of its whole way
+LEAST_WAY_SHARE = 0.1
 
 
 def require_signed_currents(run: Run, ratio: FloatArray, axes: Sequence[str]) -> None:
@@ -64,19 +72,27 @@ def refuse_unsigned(run: Run, unsigned: BoolArray, axes: Sequence[str]) -> None:
     """
     if unsigned.any():
         names = tuple(axis for axis, found in zip(axes, unsigned, strict=True) if found)
-        raise CurrentUnsigned(run.name, names, missing_sign(run.current_a[:, unsigned]))
+        missing = missing_sign(run.current_a[:, unsigned])
+        raise CurrentUnsigned(run.name, names, missing)
 
 
 def missing_sign(current: FloatArray) -> str:
-    """Return the sign that currents of one sign, shape (k,), do not have, in words."""
-    if current.max() > 0.0:
+    """Return the sign that currents of one sign do not have, in words.
+
+    Args:
+        current: of one axis or of several, shape (k,) or (k, c). A value of the other sign may be
+            there, of rounding or of an offset (OTHER_SIGN_SHARE): the larger size decides.
+    """
+    if current.max() > -current.min():
         return "negative"
     return "positive"
 
 
 def unsigned_currents(run: Run, ratio: FloatArray) -> BoolArray:
-    """Whether the current of each axis is a size without a sign, shape (n,);
-    arguments of `require_signed_currents`.
+    """Whether the current of each axis is a size without a sign, shape (n,).
+
+    Args:
+        run, ratio: as of `require_signed_currents`.
     """
     found = one_sided_currents(run, ratio)
     for axis in np.flatnonzero(found).tolist():
@@ -96,7 +112,7 @@ def _used_samples(run: Run, axis: int) -> BoolArray | slice:
 def one_sided_currents(run: Run, ratio: FloatArray) -> BoolArray:
     """Whether the current of each axis has one sign while its motor turns both ways, shape (n,).
 
-    A size has, and so has the current of a shoulder that always carries its weight.
+    That is so for a size, and also for a shoulder that always carries its weight.
     """
     motor_rad = run.position_rad @ ratio.T
     found = np.zeros(run.current_a.shape[1], dtype=np.bool_)
@@ -108,51 +124,71 @@ def one_sided_currents(run: Run, ratio: FloatArray) -> BoolArray:
 
 
 def has_one_sign(current: FloatArray) -> bool:
-    """Whether a current, shape (k,), is never below zero, or never above it."""
+    """Whether a current, shape (k,), is never below zero, or never above it, but for
+    OTHER_SIGN_SHARE.
+    """
     if not current.size:
         return False
     usual = float(np.percentile(np.abs(current), USUAL_PERCENTILE))
-    limit = BELOW_ZERO * usual
+    limit = OTHER_SIGN_SHARE * usual
     return bool(current.min() >= -limit or current.max() <= limit)
 
 
 def turns_both_ways(motor_rad: FloatArray) -> bool:
-    """Whether a motor, shape (k,), makes a good part of its way in each direction."""
+    """Whether a motor makes a good part of its way in each direction.
+
+    Args:
+        motor_rad: its positions, shape (k,).
+    """
     steps = np.diff(motor_rad)
     forwards = float(steps[steps > 0.0].sum())
     backwards = -float(steps[steps < 0.0].sum())
-    return min(forwards, backwards) > EACH_WAY * (forwards + backwards)
+    return min(forwards, backwards) > LEAST_WAY_SHARE * (forwards + backwards)
 
 
 def bounces(size: FloatArray, time_s: FloatArray) -> bool:
-    """Whether the size of a current, shape (k,), comes down to zero and turns there,
-    VISITS times and more.
+    """Whether the size of a current comes down to zero and turns there, again and again.
+
+    Args:
+        size: of the current, shape (k,).
+        time_s: of each sample, shape (k,).
     """
     usual = float(np.percentile(size, USUAL_PERCENTILE))
-    # Of a value that stays, the first sample alone: a drive may report slower than the recording.
+    # A drive may report more slowly than the recorder samples: each value counts once, at its
+    # first sample.
     start = np.flatnonzero(np.diff(size, prepend=np.nan) != 0.0)
     end = np.append(start[1:], len(size)) - 1
-    is_rest = time_s[end] - time_s[start] > REST_S
-    is_near = size[start] < NEAR_ZERO * usual
-    near = start[is_near & ~is_rest]
-    if len(near) < VISITS:
+    stays_too_long = time_s[end] - time_s[start] > LONGEST_VISIT_S
+    is_near_zero = size[start] < VISIT_SHARE * usual
+    near_zero = start[is_near_zero & ~stays_too_long]
+    if len(near_zero) < LEAST_VISITS:
         return False
-    count = float(np.diff(np.unique(size)).min())
-    fewest_visits = COARSE_VISITS
-    if count <= COARSE * usual:
-        fewest_visits = VISITS
-    visits = _visits(size, near, time_s)
+    values = np.unique(size)
+    count = float(np.diff(values).min())
+    fewest_visits = LEAST_COARSE_VISITS
+    if count <= COARSE_COUNT_SHARE * usual:
+        fewest_visits = LEAST_VISITS
+    visits = _visits(size, near_zero, time_s)
     if len(visits) < fewest_visits:
         return False
-    return rise_ratio(size, visits, time_s, RISE * usual) < BOUNCE
+    return rise_ratio(size, visits, time_s, RISE_SHARE * usual) < LARGEST_RISE_RATIO
 
 
-def _visits(size: FloatArray, near: IntArray, time_s: FloatArray) -> IntArray:
-    """Sample nearest to zero of each visit, of the samples near zero in all of them."""
-    pauses_s = np.diff(time_s[near], prepend=-np.inf)
-    first_of_visit = np.flatnonzero(pauses_s > APART_S)
+def _visits(size: FloatArray, near_zero: IntArray, time_s: FloatArray) -> IntArray:
+    """Divide samples near zero into visits, and return the smallest of each.
+
+    Args:
+        size: of the current, shape (k,).
+        near_zero: numbers of the samples near zero, ascending.
+        time_s: of each sample, shape (k,).
+
+    Returns:
+        number of the sample nearest to zero in each visit.
+    """
+    pauses_s = np.diff(time_s[near_zero], prepend=-np.inf)
+    first_of_visit = np.flatnonzero(pauses_s > LEAST_PAUSE_S)
     visits: list[int] = []
-    for samples in np.split(near, first_of_visit[1:]):
+    for samples in np.split(near_zero, first_of_visit[1:]):
         nearest = int(np.argmin(size[samples]))
         visits.append(int(samples[nearest]))
     return np.array(visits)
@@ -171,23 +207,32 @@ def rise_ratio(size: FloatArray, visits: IntArray, time_s: FloatArray, rise: flo
     Returns:
         the ratio for the shortest t; infinity where the current rises too slowly.
     """
-    step_s = time_s[1] - time_s[0]
-    longest = max(round(LONGEST_RISE_S / step_s), 1)
+    # Samples that may not be used leave gaps: the first step may be one.
+    sampling_period_s = np.median(np.diff(time_s))
+    longest = max(round(LONGEST_RISE_S / sampling_period_s), 1)
     lags = np.round(np.geomspace(1.0, longest, 40)).astype(int)
+    # t is lag samples.
     for lag in np.unique(lags).tolist():
         is_inside = (visits >= 2 * lag) & (visits < len(size) - 2 * lag)
         inside = visits[is_inside]
         if not len(inside):
             break
-        near = median_rise(size, inside, lag)
-        if near >= rise:
-            return median_rise(size, inside, 2 * lag) / near
+        rise_over_t = median_rise(size, inside, lag)
+        if rise_over_t >= rise:
+            rise_over_2t = median_rise(size, inside, 2 * lag)
+            return rise_over_2t / rise_over_t
     return float("inf")
 
 
 def median_rise(size: FloatArray, visits: IntArray, lag: int) -> float:
-    """Median over the visits of the mean size of the current, shape (k,), lag samples before and
-    after, less that of the visit.
+    """Median rise of a current from its visits to zero to the samples at a distance.
+
+    The rise of one visit is the mean of the sizes before and after it, less the size in it.
+
+    Args:
+        size: of the current, shape (k,).
+        visits: number of the sample nearest to zero in each visit.
+        lag: distance on either side, in samples.
     """
     around = 0.5 * (size[visits - lag] + size[visits + lag])
     return float(np.median(around - size[visits]))

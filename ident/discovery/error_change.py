@@ -1,29 +1,30 @@
-"""Change of the errors of all motors on data that a fit has not seen, beside its noise.
+"""Change of the errors of all motors on data that a fit has not seen, compared with its noise.
 
-Two models predict the same rows. With d_b the rise of a squared error in block b of B, the errors
-differ by more than noise where
+Two models predict the same rows. With the B blocks of moves, and d_b the rise of the squared error
+in block b, the error rises by more than noise where
 
     Σ d_b > t_(p, B − 1) · √(B/(B − 1) Σ (d_b − mean)²).
 
-One block in which an error changes much, either way, makes this σ so large that no change is seen
+One block in which an error changes much, either way, makes this σ so large that it hides a change
 which all other blocks share. So a change of the same sign by the trimmed mean counts as well (Yuen
 1974: the largest and the smallest tenth of the blocks left out, one block each at least): 10 of 11
 blocks better prove an effect, although one is worse. The reverse is not enough: a fall that two
 blocks make alone is none.
 
-Two tests are asked, the mean and the trimmed mean, so noise passes one of them more often than the
+There are two tests, the mean and the trimmed mean, so noise passes one of them more often than the
 confidence says: where it says 5 %, 5.9 to 8.5 % of changes that are noise alone pass, and 3.0 to
 4.6 % where it says 2.5 % (12 000 draws of normal and of Student-3 blocks; most with five blocks).
 The confidences of this module are those of one test.
 
 Blocks are moves, and neighbouring moves of a run are joined in pairs while their changes correlate:
 an error that differs over a region of the workspace differs in a dozen moves at once, which prove
-no more than one of them. Fewer blocks than FEWEST_BLOCKS show nothing, whatever they say: four fall
-by chance once in 16 times. One block that outweighs all others does not either: t is then near one.
+no more than one of them. Fewer blocks than FEWEST_BLOCKS show nothing, even where the error falls
+in each of them: in four blocks that happens by chance once in 16 times. One block that outweighs
+all others does not show anything either: t is then near one.
 
 A model can be worse on one motor and better in total. So the total is judged at CONFIDENCE, and a
 rise of any motor at MOTOR_CONFIDENCE, one-sided, for all motors together. A fall of the motor on
-which an effect acts counts as one, too: the effect names it before these data are asked. A rise by
+which an effect acts counts as one, too: the effect names it before these data are used. A rise by
 less than SAME_ERROR of the error is none, however certain it is: 5.76 % against 5.76 % refutes
 nothing.
 """
@@ -40,11 +41,12 @@ from ident.equations.linearisation import CORRELATED, every_other_of_run
 from ident.estimators.estimate import SAME_ERROR
 
 CONFIDENCE = 0.95  #: One-sided, of a change of the whole squared error by more than noise
-#: One-sided, that no motor's error seems to change by more than noise where none does
+#: One-sided: probability that the error of no motor seems to rise where there is noise alone
 MOTOR_CONFIDENCE = 0.99
-FEWEST_BLOCKS = 5  #: 2⁻⁵ < 1 − CONFIDENCE: with fewer, not even equal signs of all blocks are rare
-TRIMMED = 0.1  #: Share of the blocks at either end that a trimmed mean leaves out
-DOUBTFUL = 0.1  #: Share of ‖e‖ of a motor that is no small rise, although it may be noise
+FEWEST_BLOCKS = 5  #: 2⁻⁵ < 1 − CONFIDENCE < 2⁻⁴: in fewer, equal signs of all blocks are no rarity
+TRIMMED_SHARE = 0.1  #: Share of the blocks at either end that a trimmed mean leaves out
+#: Rise of ‖e‖ of a motor, as a share of it, above which it is named, although it may be noise
+DOUBTFUL_SHARE = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,11 +67,16 @@ class PairedChange:
         return 0.0
 
     def rises(self, confidence: float) -> bool:
-        """Whether the error rises by more than its noise, at a one-sided confidence."""
+        """Whether the error rises by more than its noise, at a one-sided confidence.
+
+        Either by the sum of the blocks, or by their trimmed mean.
+        """
         if self.blocks < 2 or self.rise <= 0.0:
             return False
         limit = _student_limit(self.blocks - 1, confidence)
-        return self.rise > limit * self.std or self._rises_by_trimmed_mean(confidence)
+        if self.rise > limit * self.std:
+            return True
+        return self._rises_by_trimmed_mean(confidence)
 
     def falls(self, confidence: float) -> bool:
         """Whether the error falls by more than its noise, at a one-sided confidence."""
@@ -82,15 +89,16 @@ class PairedChange:
         count = len(self.by_block)
         if count < FEWEST_BLOCKS:
             return False
-        trimmed = max(1, int(TRIMMED * count))
+        trimmed = max(1, int(TRIMMED_SHARE * count))
         changes = np.array(self.by_block)
         inner = changes[trimmed:-trimmed]
-        left = len(inner)
-        # σ² of a trimmed mean is (n − 1) s_w²/(h (h − 1)), s_w² being the winsorised variance.
+        inner_count = len(inner)
+        # σ² of a mean of h inner changes of n is (n − 1) s_w²/(h (h − 1)). s_w² is the variance of
+        # the winsorised changes: those that are trimmed take the value of the nearest inner one.
         winsorised = np.clip(changes, inner[0], inner[-1])
         scatter = (count - 1) * np.var(winsorised, ddof=1)
-        std = float(np.sqrt(scatter / (left * (left - 1))))
-        limit = _student_limit(left - 1, confidence)
+        std = float(np.sqrt(scatter / (inner_count * (inner_count - 1))))
+        limit = _student_limit(inner_count - 1, confidence)
         return float(inner.mean()) > limit * std
 
 
@@ -104,7 +112,7 @@ class ErrorChange:
 
     @property
     def each_confidence(self) -> float:
-        """One-sided confidence at which one motor is judged."""
+        """One-sided confidence at which one motor is judged (Bonferroni's correction)."""
         return 1.0 - (1.0 - MOTOR_CONFIDENCE) / len(self.motors)
 
     @property
@@ -119,7 +127,7 @@ class ErrorChange:
         for motor, change in enumerate(self.motors):
             if change.blocks < FEWEST_BLOCKS:
                 continue
-            is_large = _is_beyond(change, self.before[motor], SAME_ERROR)
+            is_large = _rises_by_share(change, self.before[motor], SAME_ERROR)
             if is_large and change.rises(self.each_confidence):
                 found.append(motor)
         return tuple(found)
@@ -129,7 +137,7 @@ class ErrorChange:
         """Motors whose error rises by much, although it may be noise."""
         found: list[int] = []
         for motor, change in enumerate(self.motors):
-            is_large = _is_beyond(change, self.before[motor], DOUBTFUL)
+            is_large = _rises_by_share(change, self.before[motor], DOUBTFUL_SHARE)
             if is_large and change.rise > change.std:
                 found.append(motor)
         return tuple(found)
@@ -142,7 +150,7 @@ class ErrorChange:
     @property
     def is_rise(self) -> bool:
         """Whether the whole error rises by more than noise, and by more than the tolerance."""
-        is_large = _is_beyond(self.total, float(self.before.sum()), SAME_ERROR)
+        is_large = _rises_by_share(self.total, float(self.before.sum()), SAME_ERROR)
         return self.is_enough and is_large and self.total.rises(CONFIDENCE)
 
     @property
@@ -155,8 +163,8 @@ class ErrorChange:
 
         Args:
             motor: that a model claims to know better; None where the total alone is judged.
-            each: one-sided confidence of either error. Two of them are asked, so noise falls more
-                often than one is.
+            each: one-sided confidence at which the total is judged, and likewise the motor. With
+                two judgements, noise counts as a fall more often than with one.
         """
         if not self.is_enough:
             return False
@@ -168,39 +176,43 @@ class ErrorChange:
         return own.blocks >= FEWEST_BLOCKS and own.falls(each)
 
     def harm(self, data: str) -> str:
-        """Say where the error on some data rises by more than noise; empty where nowhere."""
+        """Say which error on some data rises by more than noise; empty where none does."""
         if self.is_rise:
-            return f"the squared error on {data} rises by {_size(self.total)}"
+            return f"the squared error on {data} rises by {_describe_rise(self.total)}"
         worse = self.worse_motors
         if not worse:
             return ""
         worst = max(worse, key=lambda motor: self.motors[motor].sigmas)
-        size = _size(self.motors[worst])
+        size = _describe_rise(self.motors[worst])
         return f"the squared error of motor {worst + 1} on {data} rises by {size}"
 
 
 def _student_limit(freedom: int, confidence: float) -> float:
-    """Student's t at a one-sided confidence."""
+    """Quantile of Student's t at a one-sided confidence."""
     return float(scipy.special.stdtrit(freedom, confidence))
 
 
-def _is_beyond(change: PairedChange, before: float, share: float) -> bool:
-    """Whether an error ‖e‖ rises by more than a share of it."""
-    return change.rise > ((1.0 + share) ** 2 - 1.0) * before
+def _rises_by_share(change: PairedChange, before: float, share: float) -> bool:
+    """Whether an error ‖e‖ rises by more than a share of it; before is ‖e‖² before the change."""
+    largest_rise = ((1.0 + share) ** 2 - 1.0) * before
+    return change.rise > largest_rise
 
 
-def _size(change: PairedChange) -> str:
+def _describe_rise(change: PairedChange) -> str:
+    """Rise of a squared error with its σ, in words."""
     return f"{change.rise:.3g} ± {change.std:.2g} noise variances"
 
 
 def describe_noise(change: PairedChange, data: str) -> str:
-    """Say of a change that noise may have made in which direction it goes, and by how much.
+    """Say in which direction a change goes that may be noise, and by how much.
 
     Args:
         change: of the squared error.
         data: that have this error.
     """
-    verb = "falls" if change.rise < 0 else "rises"
+    verb = "rises"
+    if change.rise < 0:
+        verb = "falls"
     size = f"{abs(change.rise):.3g} ± {change.std:.2g} noise variances"
     return f"the squared error on {data} {verb} by {size}, which may be noise"
 
@@ -247,30 +259,31 @@ def change_of_errors(
     """Compare whitened squared errors of two models on the same rows.
 
     Args:
-        before, after: squared errors, those of all motors below each other, shape (rows,).
+        before, after: squared error of each row, the rows of one motor after those of another,
+            shape (rows,).
         motor: of each row, shape (rows,).
         move, run: of each row, shape (rows,).
-        motors: their number; one without rows does not change.
+        motors: number of motors; the error of one without rows does not change.
     """
     change = after - before
-    parts: list[PairedChange] = []
-    for one in range(motors):
-        own = motor == one
-        if own.any():
-            part = compare_by_block(change[own], move[own], run[own])
+    by_motor: list[PairedChange] = []
+    for number in range(motors):
+        is_own = motor == number
+        if is_own.any():
+            motor_change = compare_by_block(change[is_own], move[is_own], run[is_own])
         else:
-            part = PairedChange(0.0, 0.0, 0)
-        parts.append(part)
+            motor_change = PairedChange(0.0, 0.0, 0)
+        by_motor.append(motor_change)
     squares_before = np.bincount(motor, before, minlength=motors)
     return ErrorChange(
         total=compare_by_block(change, move, run),
-        motors=tuple(parts),
+        motors=tuple(by_motor),
         before=np.asarray(squares_before, dtype=np.float64),
     )
 
 
 def change_of_blocks(sums: FloatArray) -> PairedChange:
-    """Return the change of the whole, with σ by the scatter of the blocks.
+    """Return the change in all blocks together, with its σ by their scatter.
 
     Args:
         sums: change of the squared error in each block, shape (blocks,).

@@ -1,4 +1,4 @@
-"""Torques that depend on the joint's position alone:
+"""Torques that depend on positions alone, of one joint or of two:
 springs, gravity compensators, cables and hoses.
 """
 
@@ -26,14 +26,15 @@ from ident.model.model import Column
 from ident.model.regressor import cos_sin
 
 CABLE_REACH = 2
-"""A cable or hose is led along neighbouring joints;
-between joints far apart, others would stretch it as well.
+"""Largest distance of the two joints that a cable or hose is led along, in joints:
+between joints farther apart, others would stretch it as well.
 """
 
-CABLE_MOVES = 35
-"""As many as a term without a name needs: a cable's settings are chosen from as many shapes.
+LEAST_CABLE_MOVES = 35
+"""Fewest moves of the data with which a search tries a cable.
 
-In ten moves of a real arm, one joined that raised the error where the arm had not been.
+A term without a name needs as many: a cable's settings are chosen from as many shapes. In ten moves
+of a real arm, a cable was accepted that raised the error where the arm had not been.
 """
 
 
@@ -91,7 +92,7 @@ class Compensator(Effect):
     reported = Reported.AMPLITUDE
     needs_revolute = True
 
-    order: Annotated[int, Range(1, 1000)]  #: k, in the joint's revolutions
+    order: Annotated[int, Range(1, 1000)]  #: k, periods in one revolution of the joint
 
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Columns, shape (2, k)."""
@@ -121,11 +122,11 @@ class Counterbalance(Effect):
     needs_revolute = True
     refined = ("ratio", "phase_rad")
 
-    #: ρ; with a shorter lever the torque is that of gravity and its second harmonic, and ρ and α do
-    #: not show.
+    #: ρ; below this range the torque is that of gravity with a second harmonic, from which ρ and α
+    #: cannot be told.
     ratio: Annotated[float, Range(0.05, 0.95)]
     phase_rad: Annotated[float, Range(-10.0, 10.0)]  #: α
-    with_spring: Switch = 1  #: 1 where sin x is identified beside gravity, else 0
+    with_spring: Switch = 1  #: 1 where sin x can be told from gravity, else 0
 
     @property
     def coefficients(self) -> tuple[Column, ...]:
@@ -137,10 +138,12 @@ class Counterbalance(Effect):
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Columns, shape (2, k) or (1, k)."""
         cosine, sine = cos_sin(signals.position_rad[axis] - self.phase_rad)
-        bent = sine / np.sqrt(1.0 + self.ratio**2 - 2.0 * self.ratio * cosine)
+        relative_length = np.sqrt(1.0 + self.ratio**2 - 2.0 * self.ratio * cosine)  # w
+        sine_over_length = sine / relative_length
         if self.with_spring:
-            return np.stack((bent, sine - (1.0 - self.ratio) * bent))
-        return np.asarray(bent)[None]
+            of_spring = sine - (1.0 - self.ratio) * sine_over_length
+            return np.stack((sine_over_length, of_spring))
+        return np.asarray(sine_over_length)[None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,9 +177,9 @@ class Hinge(Effect):
 
     def columns(self, signals: Signals, axis: int) -> FloatArray:
         """Columns, shape (1, k)."""
-        return np.asarray(
-            np.maximum(0.0, self.sense * (signals.position_rad[axis] - self.start_rad))
-        )[None]
+        beyond_start = self.sense * (signals.position_rad[axis] - self.start_rad)
+        stretch = np.maximum(0.0, beyond_start)
+        return np.asarray(stretch)[None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,7 +190,7 @@ class AlongTwoJoints(Effect):
     declares = Property.INDEPENDENT_OF_VELOCITY
     abscissa = Abscissa.POSITION
     reach = CABLE_REACH
-    least_moves = CABLE_MOVES
+    least_moves = LEAST_CABLE_MOVES
 
     other_axis: AxisNumber  #: number of joint j, from 1; joint i is the one with the lower number
 
@@ -211,12 +214,12 @@ class Cable(AlongTwoJoints):
     )
 
     def columns(self, signals: Signals, axis: int) -> FloatArray:
-        """Columns, shape (2, 3, k)."""
+        """Columns, shape (2, 3, k): of a, b and c on joint i, then on joint j."""
         own = signals.position_rad[axis]
         other = signals.position_rad[self.other_axis - 1]
-        none = np.zeros_like(own)
-        on_own = np.stack((own, other, none))
-        on_other = np.stack((none, own, other))
+        zero = np.zeros_like(own)
+        on_own = np.stack((own, other, zero))
+        on_other = np.stack((zero, own, other))
         return np.stack((on_own, on_other))
 
 
@@ -238,13 +241,13 @@ class SlackCable(AlongTwoJoints):
     start_rad: Annotated[float, Range(-1e3, 1e3)] = 0.0  #: s₀
 
     def way(self, signals: Signals, axis: int) -> FloatArray:
-        """Way of the cable along both joints, per unit of its radius [rad], shape (k,)."""
+        """q_i cos φ + q_j sin φ: way of the cable, divided by √(r_i² + r_j²) [rad], shape (k,)."""
         on_own = np.cos(self.direction_rad) * signals.position_rad[axis]
         on_other = np.sin(self.direction_rad) * signals.position_rad[self.other_axis - 1]
         return np.asarray(on_own + on_other)
 
     def columns(self, signals: Signals, axis: int) -> FloatArray:
-        """Columns, shape (2, 1, k)."""
+        """Columns, shape (2, 1, k): of c on joint i, then on joint j."""
         stretch = np.maximum(0.0, self.way(signals, axis) - self.start_rad)
         on_own = np.cos(self.direction_rad) * stretch
         on_other = np.sin(self.direction_rad) * stretch

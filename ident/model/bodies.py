@@ -7,10 +7,11 @@ pseudo-inertia is
     P = [ Σ   h ]        Σ = ½ tr(I)·1 − I = ∫ r rᵀ dm.
         [ hᵀ  m ],
 
-P ≻ 0 holds for every distribution of positive mass, and only then: m > 0, I about the centre of
-mass ≻ 0 and the triangle inequality of its principal moments together (Wensing, Kim, Slotine:
-Linear Matrix Inequalities for Physically Consistent Inertial Parameter Identification, 2018). P is
-linear in the ten parameters: a linear matrix inequality.
+P ≻ 0 holds for every distribution of positive mass that is not flat, and only then: m > 0, I about
+the centre of mass ≻ 0 and the triangle inequality of its principal moments together (Wensing, Kim,
+Slotine: Linear Matrix Inequalities for Physically Consistent Inertial Parameter Identification,
+2018). For a plate, a rod or a point, P is singular, P ⪰ 0. P is linear in the ten parameters: a
+linear matrix inequality.
 """
 
 from __future__ import annotations
@@ -25,12 +26,15 @@ from ident.arrays import LARGEST_NUMBER, FloatArray, as_float, require_kind, req
 from ident.errors import ModelError
 
 LOADED = "_loaded"
-"""Ends the name of what a payload adds to a friction parameter (`Model.friction_by_payload`)."""
+"""Suffix of the name of the part of a friction parameter that a payload adds
+(`Model.friction_by_payload`).
+"""
 LINK_PARAMETERS = ("Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz", "mx", "my", "mz", "m")
 """Inertia about the link frame's origin, first moments, mass; a payload is a link too (§2.2)."""
 
 LINK_UNITS = ("kg m²",) * 6 + ("kg m",) * 3 + ("kg",)
-ROUNDING = 1e-3  #: Share of its size by which rounding in a drawing may make an inertia impossible
+#: Largest negative eigenvalue that rounding in a drawing may give, as a share of the inertia's size
+ROUNDING = 1e-3
 _ROWS, _COLUMNS = np.triu_indices(3)
 
 
@@ -55,55 +59,23 @@ class Payload:
     mass_tolerance_kg: float = 0.0
 
     def __post_init__(self) -> None:
-        written = "write Payload('disc', 'flange', {'m': 4.59})"
-        require_kind("name of a payload", self.name, str, written)
-        require_kind(f"mounting of payload {self.name!r}", self.mounting, str, written)
+        self._require_kinds()
+        _require_link_names(self)
+        _require_mass_tolerance(self)
+        _require_finite(self)
+        _require_mass_above_zero(self)
+        _require_possible_inertia(self)
+
+    def _require_kinds(self) -> None:
+        """Refuse arguments of another type, all but the tolerance, as a `ModelError`."""
+        example = "write Payload('disc', 'flange', {'m': 4.59})"
+        require_kind("name of a payload", self.name, str, example)
+        require_kind(f"mounting of payload {self.name!r}", self.mounting, str, example)
         require_kind("known", self.known, dict, "write its mass as {'m': 4.59}")
+        remedy = "give numbers in SI units: {'m': 4.59}"
         for name, value in self.known.items():
-            remedy = "give numbers in SI units: {'m': 4.59}"
             require_kind(f"known[{name!r}]", value, Real, remedy)
             require_no_flag(f"known[{name!r}]", value, remedy)
-        foreign = sorted(set(self.known) - set(LINK_PARAMETERS))
-        if foreign:
-            found = ", ".join(map(repr, foreign))
-            expected = ", ".join(LINK_PARAMETERS)
-            raise ModelError(
-                f"payload {self.name!r} has the known parameters {found}; expected names among "
-                f"{expected}; write its mass as {{'m': 4.59}}"
-            )
-        remedy = "give kilograms, such as 0.01"
-        require_kind("mass_tolerance_kg", self.mass_tolerance_kg, Real, remedy)
-        require_no_flag("mass_tolerance_kg", self.mass_tolerance_kg, remedy)
-        tolerance_kg = as_float(self.mass_tolerance_kg)
-        if not 0.0 <= tolerance_kg <= LARGEST_NUMBER:
-            found = f"a mass tolerance of {tolerance_kg:g} kg"
-            raise ModelError(
-                f"payload {self.name!r} has {found}; expected zero or more; give that of the scale"
-            )
-        beyond: list[str] = []
-        are_finite = True
-        for name, value in self.known.items():
-            size = abs(as_float(value))
-            if not size <= LARGEST_NUMBER:
-                beyond.append(f"{name} = {as_float(value):g}")
-                are_finite = are_finite and isfinite(size)
-        if beyond:
-            found = ", ".join(beyond)
-            expected = "finite numbers"
-            if are_finite:
-                expected = f"numbers of at most {LARGEST_NUMBER:g} in size"
-            raise ModelError(
-                f"payload {self.name!r} has {found}; expected {expected}; leave out "
-                "what is not known"
-            )
-        mass_kg = self.known.get("m")
-        # A negative mass would reverse the sign of every gain
-        if mass_kg is not None and not mass_kg > 0.0:
-            raise ModelError(
-                f"payload {self.name!r} weighs {mass_kg:g} kg; expected its mass, above 0 kg; "
-                "weigh it"
-            )
-        _require_possible_inertia(self)
 
     @property
     def known_parameters(self) -> FloatArray:
@@ -112,12 +84,72 @@ class Payload:
         return np.array(values)
 
 
+def _require_link_names(payload: Payload) -> None:
+    """Refuse names that are not in LINK_PARAMETERS, as a `ModelError`."""
+    foreign = sorted(set(payload.known) - set(LINK_PARAMETERS))
+    if not foreign:
+        return
+    found = ", ".join(map(repr, foreign))
+    expected = ", ".join(LINK_PARAMETERS)
+    raise ModelError(
+        f"payload {payload.name!r} has the known parameters {found}; expected names among "
+        f"{expected}; write its mass as {{'m': 4.59}}"
+    )
+
+
+def _require_mass_tolerance(payload: Payload) -> None:
+    """Refuse a tolerance that is no number, negative or not finite, as a `ModelError`."""
+    remedy = "give kilograms, such as 0.01"
+    require_kind("mass_tolerance_kg", payload.mass_tolerance_kg, Real, remedy)
+    require_no_flag("mass_tolerance_kg", payload.mass_tolerance_kg, remedy)
+    tolerance_kg = as_float(payload.mass_tolerance_kg)
+    if not 0.0 <= tolerance_kg <= LARGEST_NUMBER:
+        found = f"a mass tolerance of {tolerance_kg:g} kg"
+        raise ModelError(
+            f"payload {payload.name!r} has {found}; expected zero or more; give that of the scale"
+        )
+
+
+def _require_finite(payload: Payload) -> None:
+    """Refuse values that are not finite or above LARGEST_NUMBER, as a `ModelError`."""
+    too_large: list[str] = []
+    are_finite = True
+    for name, value in payload.known.items():
+        size = abs(as_float(value))
+        if not size <= LARGEST_NUMBER:
+            too_large.append(f"{name} = {as_float(value):g}")
+            if not isfinite(size):
+                are_finite = False
+    if not too_large:
+        return
+    found = ", ".join(too_large)
+    expected = "finite numbers"
+    if are_finite:
+        expected = f"numbers of at most {LARGEST_NUMBER:g} in size"
+    raise ModelError(
+        f"payload {payload.name!r} has {found}; expected {expected}; leave out what is not known"
+    )
+
+
+def _require_mass_above_zero(payload: Payload) -> None:
+    """Refuse a known mass that is not above zero, as a `ModelError`."""
+    mass_kg = payload.known.get("m")
+    # A negative mass would reverse the sign of every gain.
+    if mass_kg is not None and not mass_kg > 0.0:
+        raise ModelError(
+            f"payload {payload.name!r} weighs {mass_kg:g} kg; expected its mass, above 0 kg; "
+            "weigh it"
+        )
+
+
 def _require_possible_inertia(payload: Payload) -> None:
-    """Refuse an inertia that no distribution of mass has, as far as it is known; a point may be.
+    """Refuse an inertia that no distribution of mass has, as far as it is known.
+
+    A point, a rod and a plate are accepted.
 
     Raises:
-        ModelError: the second moments Σ, or the pseudo-inertia where the centre is known too, have
-            a negative value.
+        ModelError: the second moments Σ, or the pseudo-inertia where all ten parameters are known,
+            have a negative eigenvalue; or a moment of inertia is negative.
     """
     known = payload.known
     moments = set(LINK_PARAMETERS[:6])
@@ -125,9 +157,9 @@ def _require_possible_inertia(payload: Payload) -> None:
         _require_no_negative_moment(payload)
         return
     pseudo = pseudo_inertia(payload.known_parameters)
-    if set(known) != set(LINK_PARAMETERS):
-        pseudo = pseudo[:3, :3]
     second_moments = pseudo[:3, :3]
+    if set(known) != set(LINK_PARAMETERS):
+        pseudo = second_moments
     size = max(float(np.trace(second_moments)), 0.0)
     # The rows of the second moments and of the mass have other units: compare them at a common
     # size.
@@ -151,11 +183,7 @@ def _require_possible_inertia(payload: Payload) -> None:
 
 
 def _require_no_negative_moment(payload: Payload) -> None:
-    """Refuse a negative moment of inertia among what is known.
-
-    Raises:
-        ModelError: one is.
-    """
+    """Refuse a known moment of inertia that is negative, as a `ModelError`."""
     found: list[str] = []
     for name in ("Ixx", "Iyy", "Izz"):
         value = payload.known.get(name, 0.0)
@@ -189,15 +217,15 @@ def pseudo_factors(links: FloatArray) -> FloatArray:
 
 
 def link_parameters(pseudo: FloatArray) -> FloatArray:
-    """The inverse of `pseudo_inertia`, (4, 4) → (10,); of the mean with the transpose."""
+    """The inverse of `pseudo_inertia`, (4, 4) → (10,), for the symmetric part of the matrix."""
     symmetric = 0.5 * (pseudo + pseudo.T)
     second_moments = symmetric[:3, :3]
     first_moments = symmetric[:3, 3]
     inertia = np.trace(second_moments) * np.eye(3) - second_moments
-    return _ten(inertia, first_moments, symmetric[3, 3])
+    return _as_parameters(inertia, first_moments, symmetric[3, 3])
 
 
-def _ten(inertia: FloatArray, first_moment: FloatArray, mass: float) -> FloatArray:
+def _as_parameters(inertia: FloatArray, first_moment: FloatArray, mass: float) -> FloatArray:
     """Parameters of a link in the order of LINK_PARAMETERS, shape (10,)."""
     upper = inertia[_ROWS, _COLUMNS]
     return np.concatenate((upper, first_moment, (mass,)))
@@ -217,7 +245,7 @@ class Body:
         """About the link frame's origin (Huygens-Steiner), as LINK_PARAMETERS, shape (10,)."""
         mass = self.mass_kg
         inertia = self.inertia_kg_m2 + mass * steiner(self.centre_m)
-        return _ten(inertia, mass * self.centre_m, mass)
+        return _as_parameters(inertia, mass * self.centre_m, mass)
 
 
 def body_of(link: FloatArray) -> Body:

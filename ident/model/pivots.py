@@ -2,15 +2,15 @@
 joints without a motor that the tree of joints does not have.
 
 A loop is cut at one of its joints, and closed again by equations (`ident.model.robot.Closure`).
-Where the two frames of a closure can only turn about one axis a of the first of them, the cut joint
-is a pivot. With the angular velocities of the two links, its speed and its power are
+Where the frames of a closure can turn about one axis only, the axis a of the first frame, the cut
+joint is a pivot. With the angular velocities ω₁, ω₂ of the two links, its speed and its power are
 
     ψ̇ = a · (ω₂ − ω₁) = J_ψ q̇,    τ_ψ ψ̇ = (J_ψᵀ τ_ψ)ᵀ q̇,
 
 so that a torque τ_ψ in the pivot acts as J_ψᵀ τ_ψ on the joints of the tree (virtual power, as for
-a passive joint in Briot & Gautier, Multibody System Dynamics 2015). Both links turn about parallel
-axes on their way to the pivot, or the closure holds the other two angles; then a · (ω₂ − ω₁) counts
-every revolute joint of the loop.
+a passive joint in Briot & Gautier, Multibody System Dynamics 2015). Either all revolute joints of
+the loop are parallel to a, or the closure holds the other two angles: ω₂ − ω₁ has the direction of
+a, and a · (ω₂ − ω₁) counts every revolute joint of the loop.
 
 A ball joint turns about three axes at once and has no such angle: it is no pivot here, and friction
 in it has no name.
@@ -29,10 +29,10 @@ from ident.model.closures import joint_axes, loops, spin
 from ident.model.robot import Closure, JointKind, Motion, Pivot, Poses, Robot, joints_to_base, poses
 
 #: Difference of two joints' speeds, relative to the largest, below which they turn alike
-ALIKE = 1e-7
-PARALLEL = 1e-6  #: Sine of the angle between two axes that count as parallel
-AWAY = (0.0, 0.06, -0.09)
-"""Lengths of the motions from the assembly pose after which speeds are compared [rad or m]."""
+ALIKE_TOLERANCE = 1e-7
+PARALLEL_SINE = 1e-6  #: Sine of the angle between two axes that count as parallel
+DISTANCES_FROM_ASSEMBLY = (0.0, 0.06, -0.09)
+"""Distances of the poses at which speeds are compared from the assembly pose [rad or m]."""
 
 
 def cut_pivots(robot: Robot) -> tuple[Pivot, ...]:
@@ -62,21 +62,25 @@ def cut_pivots(robot: Robot) -> tuple[Pivot, ...]:
     known = [speeds[:, joint] for joint in range(count)]
     found: list[Pivot] = []
     for number, pivot in enumerate(turning):
-        own = speeds[:, count + number]
-        turns = float(np.abs(own).max()) > 0.0
-        is_known = any(_turn_alike(own, other) for other in known)
+        speed = speeds[:, count + number]
+        turns = float(np.abs(speed).max()) > 0.0
+        is_known = any(_turn_alike(speed, other) for other in known)
         if turns and not is_known:
             found.append(pivot)
-            known.append(own)
+            known.append(speed)
     return tuple(found)
 
 
 def _turn_alike(own: FloatArray, other: FloatArray) -> bool:
-    """Whether speeds are those of another joint in every motion, or their negatives."""
+    """Whether speeds are those of another joint in every motion, or their negatives.
+
+    Args:
+        own, other: speeds in each of the motions, shape (motions,).
+    """
     largest = float(np.abs(own).max())
     difference = np.abs(own - other).max()
     difference_to_negative = np.abs(own + other).max()
-    return bool(min(difference, difference_to_negative) <= ALIKE * largest)
+    return bool(min(difference, difference_to_negative) <= ALIKE_TOLERANCE * largest)
 
 
 def pivot_rates(robot: Robot, position_rad: FloatArray) -> FloatArray:
@@ -107,10 +111,12 @@ def pivot_motion(robot: Robot, assembly: Assembly, joints: Motion) -> Motion:
     """Motion of the p pivots from that of all n joints, arrays of shape (k, p).
 
     An angle is zero where the two frames of the closure are parallel. It is the one within half a
-    turn of the angle at the assembly pose. The relative angular acceleration is that of joints
-    about axes that the links before them turn,
+    turn of the angle at the assembly pose. The axis a_j of each joint turns with the link before
+    it, so that
 
-        ψ̈ = J_ψ q̈ + a · Σ ± ω_parent × (a_j q̇_j).
+        ψ̈ = J_ψ q̈ + a · Σ_j ± ω_parent(j) × (a_j q̇_j).
+
+    a turns too, but with ω₂ − ω₁ in its direction, (ω₁ × a) · (ω₂ − ω₁) is zero.
 
     Args:
         robot: with p pivots.
@@ -127,7 +133,7 @@ def pivot_motion(robot: Robot, assembly: Assembly, joints: Motion) -> Motion:
     placed = poses(robot, joints.position_rad)
     assembled = poses(robot, assembly.position_rad[None])
     axes = joint_axes(robot, placed)
-    turning = spin(robot, placed, axes, joints.velocity_rad_s).angular
+    angular_velocity = spin(robot, placed, axes, joints.velocity_rad_s).angular
     for number, pivot in enumerate(robot.pivots):
         middle = _angle(robot, assembled, pivot)
         away = _angle(robot, placed, pivot) - middle
@@ -137,10 +143,10 @@ def pivot_motion(robot: Robot, assembly: Assembly, joints: Motion) -> Motion:
         loop = _loop(robot, robot.closures[pivot.closure])
         for joint, sign in loop.items():
             parent = robot.joints[joint].parent
-            of_parent = turning[parent + 1]
-            own = axes[joint] * joints.velocity_rad_s[:, joint, None]
-            turned = np.cross(of_parent, own)
-            along = np.einsum("ki,ki->k", about, turned)  # a · (ω × a_j q̇_j)
+            of_parent = angular_velocity[parent + 1]
+            of_joint = axes[joint] * joints.velocity_rad_s[:, joint, None]
+            change = np.cross(of_parent, of_joint)
+            along = np.einsum("ki,ki->k", about, change)  # a · (ω × a_j q̇_j)
             acceleration[:, number] += sign * along
     return Motion(position, velocity, acceleration)
 
@@ -148,27 +154,27 @@ def pivot_motion(robot: Robot, assembly: Assembly, joints: Motion) -> Motion:
 def _pivot_of(robot: Robot, index: int) -> Pivot | None:
     """Return the pivot of a closure; None of one that turns about no axis or about several."""
     directions = robot.closures[index].directions
-    lengths: list[int] = []
-    free: list[int] = []
+    translates: list[int] = []
+    turns: list[int] = []
     for axis, name in enumerate("xyz"):
-        if name in directions:
-            lengths.append(axis)
+        if name not in directions:
+            translates.append(axis)
         if f"r{name}" not in directions:
-            free.append(axis)
-    if len(free) == 1:
-        return Pivot(index, free[0])
-    if len(free) < 3 or len(lengths) != 2:
+            turns.append(axis)
+    if len(turns) == 1:
+        return Pivot(index, turns[0])
+    # A planar mechanism holds two translations alone: it turns about the third axis.
+    if len(turns) < 3 or len(translates) != 1:
         return None
-    (about,) = {0, 1, 2}.difference(lengths)
-    pivot = Pivot(index, about)
+    pivot = Pivot(index, translates[0])
     if _is_planar(robot, pivot):
         return pivot
     return None
 
 
 def _is_planar(robot: Robot, pivot: Pivot) -> bool:
-    """Whether every revolute joint of the loop turns about the pivot's axis:
-    it then does so at every position.
+    """Whether every revolute joint of the loop is parallel to the pivot's axis at position zero,
+    and so at every position.
     """
     placed = poses(robot, np.zeros((1, robot.joint_count)))
     about = _axis(robot, placed, pivot)
@@ -176,7 +182,7 @@ def _is_planar(robot: Robot, pivot: Pivot) -> bool:
     loop = _loop(robot, robot.closures[pivot.closure])
     for joint in loop:
         across = np.cross(about, axes[joint])
-        if np.linalg.norm(across) > PARALLEL:
+        if np.linalg.norm(across) > PARALLEL_SINE:
             return False
     return True
 
@@ -208,6 +214,7 @@ def _angle(robot: Robot, placed: Poses, pivot: Pivot) -> FloatArray:
     frame = placed.rotation[first.joint + 1] @ first.rotation
     other = placed.rotation[second.joint + 1] @ second.rotation
     turned = np.swapaxes(frame, 1, 2) @ other
+    # About z, the rotation has cos ψ at (x, x) and sin ψ at (y, x).
     following = (pivot.axis + 1) % 3
     last = (pivot.axis + 2) % 3
     sine = turned[:, last, following]
@@ -216,14 +223,17 @@ def _angle(robot: Robot, placed: Poses, pivot: Pivot) -> FloatArray:
 
 
 def _speeds_near(robot: Robot, assembly: Assembly) -> FloatArray:
-    """Speeds of joints and pivots in free motions near the assembly pose, (motions, n + p)."""
+    """Speeds of joints and pivots in free motions near the assembly pose, (motions, n + p).
+
+    The free motions of a pose are the null space of the closures' Jacobian.
+    """
     draw = np.random.default_rng(0)
     assembled = loops(robot, assembly.position_rad[None], assembly.size_m)
     free = null_space(assembled.jacobian[0])
     speeds: list[FloatArray] = []
-    for size in AWAY:
+    for distance in DISTANCES_FROM_ASSEMBLY:
         drawn = draw.standard_normal(free.shape[1])
-        near = assembly.position_rad + size * free @ drawn
+        near = assembly.position_rad + distance * free @ drawn
         position, _ = towards_closed(robot, near, assembly.size_m, range(robot.joint_count))
         closing = loops(robot, position[None], assembly.size_m)
         of_joints = null_space(closing.jacobian[0])

@@ -39,8 +39,8 @@ class Joint:
     rotation: FloatArray
     translation_m: FloatArray  #: its origin there, (3,)
     axis: FloatArray  #: unit vector of the motion in the joint frame, (3,)
-    #: From the lowest to the highest position that its description allows [rad or m]; None where
-    #: it has no limits. Positions in another unit go far beyond it.
+    #: Distance from the lowest to the highest position that its description allows [rad or m]; None
+    #: where it has no limits. Positions in another unit go far beyond it.
     travel: float | None = None
     #: Lowest position that its description allows [rad or m]; None where it has no limits.
     lowest: float | None = None
@@ -62,13 +62,13 @@ class Place:
     translation_m: FloatArray  #: its origin there, (3,)
 
 
-UNIT_TOLERANCE = 1e-6  #: Of the length of a joint's axis from one
+UNIT_TOLERANCE = 1e-6  #: Largest difference of the length of a joint's axis from one
 
-#: What the name of a closure follows in the name of the joint that the loop was cut at
-PIVOT = "pivot"
+#: Before the name of a closure in the name of its pivot
+PIVOT_PREFIX = "pivot"
 
 DIRECTIONS = ("x", "y", "z", "rx", "ry", "rz")
-"""Along and about the axes of the first frame of a closure."""
+"""Directions in which a closure holds: along and about the axes of its first frame."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -160,7 +160,9 @@ class Robot:
     @property
     def axis_joints(self) -> tuple[int, ...]:
         """Joint of each axis."""
-        return self.motors or tuple(range(len(self.joints)))
+        if self.motors:
+            return self.motors
+        return tuple(range(len(self.joints)))
 
     @property
     def axes(self) -> tuple[Joint, ...]:
@@ -177,7 +179,7 @@ class Robot:
         """Joints at which an effect can act: those of the axes, then those without a motor.
 
         A follower is none: it turns as its leader does, so friction or a spring in it is one in its
-            leader.
+        leader.
         """
         followers = {coupling.follower for coupling in self.couplings}
         passive = [joint for joint in self.passive_joints if joint not in followers]
@@ -193,10 +195,11 @@ class Robot:
         return (*joints, *pivots)
 
     def _as_joint(self, pivot: Pivot) -> Joint:
+        """A pivot as a joint behind the link of its closure's first frame."""
         closure = self.closures[pivot.closure]
         first = closure.first
         return Joint(
-            name=f"{PIVOT} {closure.name}",
+            name=f"{PIVOT_PREFIX} {closure.name}",
             kind=JointKind.REVOLUTE,
             parent=first.joint,
             rotation=first.rotation,
@@ -221,7 +224,7 @@ class Robot:
 
     @property
     def axis_count(self) -> int:
-        """m: motors, and what a recording has columns of."""
+        """m: number of motors, and of the columns of a recording."""
         return len(self.axis_joints)
 
 
@@ -299,7 +302,7 @@ def _require_place(label: str, place: Place, count: int) -> None:
 
 
 def _require_index(label: str, index: object, end: int, *, least: int = 0) -> None:
-    """Refuse what is no index of a joint from `least` to below `end`, as a `ModelError`."""
+    """Refuse an index that is not in [least, end), as a `ModelError`."""
     if not is_whole_number(index) or not least <= index < end:
         raise ModelError(
             f"{label} is {index!r:.60}; expected a whole number from {least} to {end - 1}; "
@@ -314,7 +317,7 @@ class Motion:
     Lists and data frames will do for arrays.
 
     Raises:
-        ModelError: one is no array of numbers.
+        ModelError: one of them is no array of numbers.
     """
 
     position_rad: FloatArray  #: q
@@ -360,7 +363,7 @@ class Poses:
 
 
 def poses(robot: Robot, position_rad: FloatArray) -> Poses:
-    """Forward kinematics.
+    """Forward kinematics: find the pose of every joint's frame in the base.
 
     Args:
         robot: n joints.
@@ -371,7 +374,7 @@ def poses(robot: Robot, position_rad: FloatArray) -> Poses:
     origin = np.empty((count + 1, samples, 3))
     rotation[0] = np.eye(3)
     origin[0] = 0.0
-    own = _own_rotations(robot, position_rad)
+    in_parent = _rotations_in_parent(robot, position_rad)
     for index, joint in enumerate(robot.joints):
         before = joint.parent + 1
         here = index + 1
@@ -380,21 +383,22 @@ def poses(robot: Robot, position_rad: FloatArray) -> Poses:
         if joint.kind is JointKind.PRISMATIC:
             direction = parent @ (joint.rotation @ joint.axis)
             origin[here] += position_rad[:, index, None] * direction
-        np.matmul(parent, own[index], out=rotation[here])
+        np.matmul(parent, in_parent[index], out=rotation[here])
     return Poses(rotation, origin)
 
 
 def joints_to_base(robot: Robot, joint: int) -> Iterator[int]:
-    """A joint and those before it, to the base; none of the base itself, -1."""
+    """Yield a joint and those before it, down to the base; nothing for the base itself, -1."""
     while joint >= 0:
         yield joint
         joint = robot.joints[joint].parent
 
 
-def _own_rotations(robot: Robot, position_rad: FloatArray) -> FloatArray:
+def _rotations_in_parent(robot: Robot, position_rad: FloatArray) -> FloatArray:
     """Rotation of each joint's frame in its parent's, shape (n, k, 3, 3).
 
-    Rodrigues' formula for all joints at once, R = R₀ (a aᵀ + cos q (1 − a aᵀ) + sin q [a]).
+    Rodrigues' formula for all joints at once, R = R₀ (a aᵀ + cos q (1 − a aᵀ) + sin q [a]), with
+    [a] the matrix of a ×. A prismatic joint does not turn: its angle is zero.
     """
     joints = robot.joints
     axes = np.array([joint.axis for joint in joints])
@@ -402,11 +406,12 @@ def _own_rotations(robot: Robot, position_rad: FloatArray) -> FloatArray:
     is_revolute = np.array([joint.kind is JointKind.REVOLUTE for joint in joints])
     outer = axes[:, :, None] * axes[:, None]
     crosses = np.array([skew(axis) for axis in axes])
-    parts = np.stack((outer, np.eye(3) - outer, crosses), axis=1)
-    parts = fixed[:, None] @ parts
+    across = np.eye(3) - outer
+    terms = np.stack((outer, across, crosses), axis=1)
+    terms_in_parent = fixed[:, None] @ terms
     angle = position_rad.T * is_revolute[:, None]
     factors = np.stack((np.ones_like(angle), np.cos(angle), np.sin(angle)), axis=2)
-    rotations = factors @ parts.reshape(-1, 3, 9)
+    rotations = factors @ terms_in_parent.reshape(-1, 3, 9)
     return np.asarray(rotations.reshape(*angle.shape, 3, 3))
 
 

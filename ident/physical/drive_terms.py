@@ -11,7 +11,7 @@ motor m and a of each joint,
 
 and the same with fv and fvm. No simulator has a negative a or t. Where identified values would need
 one, t_m is as large as a ≥ 0 allows, the diagonal is still right, and the rest of Iam_m is named as
-left out.
+left out. Dry friction is not split: fs is that of the joints, fsm that of the motors.
 """
 
 from __future__ import annotations
@@ -25,23 +25,29 @@ from ident.arrays import FloatArray
 from ident.model.bodies import LOADED
 from ident.model.model import COUPLED_COLUMNS, JOINT_COLUMNS, Model
 
-ROUNDING = 1e-12  #: Share of a parameter below which what is left of it is rounding error
+ROUNDING = 1e-12  #: Share of a parameter up to which what is left of it is rounding error
+
+#: Iam, fvm and fsm among the COUPLED_COLUMNS of a motor
+INERTIA, VISCOUS, DRY = range(COUPLED_COLUMNS)
 
 
 @dataclass(frozen=True, slots=True)
 class LeftOver:
-    """A part of a standard parameter that single joints and motors cannot have:
-    its column times this is missing.
+    """A part of a standard parameter that single joints and motors cannot have.
+
+    The torque that it causes, its column of the regressor times the value, is missing.
     """
 
     name: str  #: of the standard parameter
-    value: float  #: what is missing of it [unit]
-    unit: str
+    value: float  #: the part that is missing, in the unit
+    unit: str  #: of the standard parameter
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Terms:
-    """Inertia, damping or dry friction, none of them negative."""
+    """One quantity (inertia, damping or dry friction) of single joints and of motors; none of its
+    values is negative.
+    """
 
     of_axes: FloatArray  #: of the joint of each axis alone, shape (m,)
     #: of each motor along its direction, zero for one that turns with one joint, shape (m,)
@@ -50,16 +56,17 @@ class Terms:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DriveTerms:
-    """What rotors and friction of a robot amount to."""
+    """Rotors and friction of a robot, as simulators have them."""
 
     inertia: Terms  #: [kg m²; kg of a prismatic joint]
     damping: Terms  #: [Nm/(rad/s); N/(m/s)]
     dry_friction: Terms  #: [Nm; N]
-    left_over: tuple[LeftOver, ...]  #: offsets, friction that drives, couplings that no rotor has
+    #: offsets, negative friction, and couplings that no rotor has
+    left_over: tuple[LeftOver, ...]
 
 
 def drive_terms(model: Model, standard: FloatArray) -> DriveTerms:
-    """Split the standard parameters of the drives.
+    """Split the standard parameters of the drives into terms of joints and of motors.
 
     Args:
         model: the declared model.
@@ -67,8 +74,9 @@ def drive_terms(model: Model, standard: FloatArray) -> DriveTerms:
     """
     coupled = list(model.drive_train.coupled)
     first = JOINT_COLUMNS * model.robot.joint_count
-    last = first + COUPLED_COLUMNS * len(coupled)
-    of_coupled = slice(first, last)
+    end = first + COUPLED_COLUMNS * len(coupled)
+    of_coupled = slice(first, end)
+    # Iam, fvm and fsm of each motor
     of_motors = np.zeros((model.robot.axis_count, COUPLED_COLUMNS))
     of_motors[coupled] = standard[of_coupled].reshape(-1, COUPLED_COLUMNS)
     rotors = standard[model.rotor_columns]
@@ -76,37 +84,39 @@ def drive_terms(model: Model, standard: FloatArray) -> DriveTerms:
     dry = standard[model.dry_friction_columns]
     directions = model.drive_train.direction
     squares = directions**2
-    for kind, of_joints in enumerate((rotors, viscous)):
-        own = of_motors[:, kind]
-        is_negative = own < 0.0
-        exceeds_joints = own @ squares > of_joints
+    for column, of_joints in ((INERTIA, rotors), (VISCOUS, viscous)):
+        values = of_motors[:, column]
+        is_negative = values < 0.0
+        exceeds_joints = values @ squares > of_joints
         if np.any(is_negative) or np.any(exceeds_joints):
-            of_motors[coupled, kind] = _least_of_motors(own[coupled], directions[coupled])
-    inertia = _split(rotors, of_motors[:, 0], squares)
-    damping = _split(viscous, of_motors[:, 1], squares)
+            of_motors[coupled, column] = _least_of_motors(values[coupled], directions[coupled])
+    inertia = _split(rotors, of_motors[:, INERTIA], squares)
+    damping = _split(viscous, of_motors[:, VISCOUS], squares)
     dry_friction = Terms(
         of_axes=np.maximum(dry, 0.0),
-        of_motors=np.maximum(of_motors[:, 2], 0.0),
+        of_motors=np.maximum(of_motors[:, DRY], 0.0),
     )
+    # The least parameters of the coupled motors give the same torque as the identified ones.
     wanted = standard.copy()
     wanted[of_coupled] = of_motors[coupled].ravel()
     missing = wanted - _standard_of(model, inertia, damping, dry_friction)
     missing[model.link_columns] = 0.0
     left_over: list[LeftOver] = []
-    for column, value, identified in zip(model.columns, missing, standard, strict=True):
-        # What a payload adds to friction is no part of the robot without one.
+    for parameter, value, identified in zip(model.columns, missing, standard, strict=True):
         is_missing = abs(value) > ROUNDING * abs(identified)
-        if is_missing and not column.name.endswith(LOADED):
-            left_over.append(LeftOver(column.name, float(value), column.unit))
+        # What a payload adds to friction is no part of the robot without one.
+        is_of_payload = parameter.name.endswith(LOADED)
+        if is_missing and not is_of_payload:
+            left_over.append(LeftOver(parameter.name, float(value), parameter.unit))
     return DriveTerms(inertia, damping, dry_friction, tuple(left_over))
 
 
 def _least_of_motors(of_motors: FloatArray, directions: FloatArray) -> FloatArray:
-    """The least Iam or fvm that couple the joints alike, shape (c,).
+    """Return the least Iam or fvm that couple the joints as the identified ones do, shape (c,).
 
-    None of them is negative where that is possible. Both motors of a differential couple its joints
-    with opposite signs: the torque shows their difference, and what both have in common would only
-    need room at the joints.
+    None of them is negative; where that is impossible, the identified ones are returned. Both
+    motors of a differential couple its joints with opposite signs: the torque shows their
+    difference only, and what both have in common would be taken from the joints.
 
     Args:
         of_motors: Iam or fvm of the motors that turn with several joints, shape (c,).
@@ -114,6 +124,7 @@ def _least_of_motors(of_motors: FloatArray, directions: FloatArray) -> FloatArra
     """
     first, second = np.triu_indices(directions.shape[1], 1)
     products = directions[:, first] * directions[:, second]
+    # Off-diagonal element of r rᵀ for each pair of joints (row) and motor (column)
     couplings = products.T
     wanted = couplings @ of_motors
     least, residual = nnls(couplings, wanted)
@@ -130,20 +141,21 @@ def _split(of_joints: FloatArray, of_motors: FloatArray, squares: FloatArray) ->
         of_motors: Iam or fvm, zero for a motor that turns with one joint, shape (m,).
         squares: r², shape (m motors, m axes).
     """
-    room = np.maximum(of_joints, 0.0)
+    diagonal = np.maximum(of_joints, 0.0)
     wanted = np.maximum(of_motors, 0.0)
-    used = wanted @ squares
-    allowed = np.ones(len(room))
-    is_short = used > room
-    allowed[is_short] = room[is_short] / used[is_short]
-    shares = [float(allowed[row > 0.0].min()) for row in squares]
-    motors_alone = wanted * np.array(shares)
-    axes_alone = np.maximum(room - motors_alone @ squares, 0.0)
+    diagonal_of_motors = wanted @ squares
+    # Where the motors would exceed the diagonal of a joint, each of them gets a share only.
+    allowed_share = np.ones(len(diagonal))
+    exceeds = diagonal_of_motors > diagonal
+    allowed_share[exceeds] = diagonal[exceeds] / diagonal_of_motors[exceeds]
+    share_of_motor = [float(allowed_share[row > 0.0].min()) for row in squares]
+    motors_alone = wanted * np.array(share_of_motor)
+    axes_alone = np.maximum(diagonal - motors_alone @ squares, 0.0)
     return Terms(of_axes=axes_alone, of_motors=motors_alone)
 
 
 def _standard_of(model: Model, inertia: Terms, damping: Terms, dry_friction: Terms) -> FloatArray:
-    """Standard parameters of such terms, shape (c,)."""
+    """Return the standard parameters that these terms amount to, shape (c,)."""
     squares = model.drive_train.direction**2
     standard = np.zeros(len(model.columns))
     standard[model.rotor_columns] = inertia.of_axes + inertia.of_motors @ squares
@@ -151,8 +163,8 @@ def _standard_of(model: Model, inertia: Terms, damping: Terms, dry_friction: Ter
     standard[model.dry_friction_columns] = dry_friction.of_axes
     first = JOINT_COLUMNS * model.robot.joint_count
     for motor in model.drive_train.coupled:
-        standard[first] = inertia.of_motors[motor]
-        standard[first + 1] = damping.of_motors[motor]
-        standard[first + 2] = dry_friction.of_motors[motor]
+        standard[first + INERTIA] = inertia.of_motors[motor]
+        standard[first + VISCOUS] = damping.of_motors[motor]
+        standard[first + DRY] = dry_friction.of_motors[motor]
         first += COUPLED_COLUMNS
     return standard

@@ -33,6 +33,7 @@ TIME_S = np.arange(SAMPLES) / RATE_HZ
 COUNT_RAD = 2.0 * np.pi / 65536
 NOISE_A = 0.05
 COUPLED = np.array([[30.0, 0.0], [-20.0, 25.0]])
+DIFFERENTIAL = np.array([[30.0, 20.0], [30.0, -20.0]])
 TRUTH = three_axes_truth()
 
 
@@ -297,10 +298,33 @@ def test_a_frozen_encoder_of_a_coupled_joint_is_found() -> None:
     assert (found.kind, found.axis) == (FaultKind.FROZEN, 1)
 
 
+def test_frozen_encoders_of_two_joints_of_a_differential_are_both_found() -> None:
+    motor_rad, current = sound()
+    joint_rad = np.linalg.solve(DIFFERENTIAL, motor_rad.T).T
+    joint_rad[1500:1800, 0] = joint_rad[1500, 0]
+    joint_rad[3000:3300, 1] = joint_rad[3000, 1]
+    faults = find_faults(joint_rad, current, RATE_HZ, DIFFERENTIAL)
+    assert [(one.kind, one.axis) for one in faults] == [
+        (FaultKind.FROZEN, 0),
+        (FaultKind.FROZEN, 1),
+    ]
+
+
 def test_what_is_known_to_be_missing_is_no_finding() -> None:
     position, current = damaged_position(zeroed(1500, 1540))
     usable = np.ones(position.shape, dtype=np.bool_)
     usable[1500:1540, 1] = False
+    faults = find_faults(position, current, RATE_HZ, usable=usable)
+    assert faults == ()
+
+
+def test_a_first_sample_that_is_known_to_be_missing_is_no_finding() -> None:
+    position, current = sound()
+    position[0, 1] += 1.0
+    (found,) = find_faults(position, current, RATE_HZ)
+    assert found.stretches.tolist() == [[0, 1]]
+    usable = np.ones(position.shape, dtype=np.bool_)
+    usable[0, 1] = False
     faults = find_faults(position, current, RATE_HZ, usable=usable)
     assert faults == ()
 

@@ -17,8 +17,8 @@ from ident.data.glitches import (
     Jumps,
     Readings,
     find_jumps,
-    is_split,
     smallest_change,
+    upper_part,
     wrap_size,
 )
 
@@ -261,10 +261,10 @@ def test_a_current_that_friction_turns_between_two_values_is_no_counter() -> Non
 
 def test_negative_numbers_without_their_sign_are_in_the_upper_part() -> None:
     values = np.tile([1.0, 2.0, 99.0, 98.0], 5)
-    upper = is_split(values)
+    upper = upper_part(values)
     assert upper is not None
     assert upper.tolist() == [False, False, True, True] * 5
-    mirrored = is_split(-values)
+    mirrored = upper_part(-values)
     assert mirrored is not None
     assert mirrored.tolist() == [True, True, False, False] * 5
 
@@ -281,7 +281,7 @@ def test_negative_numbers_without_their_sign_are_in_the_upper_part() -> None:
     ids=lambda value: value if isinstance(value, str) else "",
 )
 def test_other_values_are_not_split(values: list[float], reason: str) -> None:
-    assert is_split(np.array(values)) is None, reason
+    assert upper_part(np.array(values)) is None, reason
 
 
 @pytest.mark.parametrize(("place", "is_empty"), [(26.0, False), (24.0, True), (76.0, True)])
@@ -289,7 +289,7 @@ def test_the_middle_is_between_a_quarter_and_three_quarters_of_the_range(
     place: float, is_empty: bool
 ) -> None:
     values = np.array([0.0, 100.0] * 30 + [place, 0.0])
-    assert (is_split(values) is not None) is is_empty
+    assert (upper_part(values) is not None) is is_empty
 
 
 # Counts

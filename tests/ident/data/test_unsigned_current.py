@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ident.data.run import Run
-from ident.data.unsigned_current import unsigned_currents
+from ident.data.unsigned_current import bounces, missing_sign, unsigned_currents
 from ident.errors import CurrentUnsigned
 from ident.estimators.identify import identify
 from tests.ident.mistaken import AXES, SMALL, small_recordings
@@ -143,3 +143,19 @@ def test_samples_that_are_no_use_do_not_hide_a_size(small_truth: Truth, runs: li
     found = replace(size, current_a=current, valid=valid)
     ratio = small_truth.model.drive_train.ratio
     assert unsigned_currents(found, ratio).all()
+
+
+def test_a_gap_after_the_first_sample_does_not_hide_a_size() -> None:
+    time_s = 0.002 * np.arange(5000)
+    absolute_current = np.abs(3.0 * np.sin(2.0 * np.pi * 0.7 * time_s))
+    is_used = np.ones(len(time_s), dtype=np.bool_)
+    is_used[1:200] = False
+    assert bounces(absolute_current, time_s)
+    assert bounces(absolute_current[is_used], time_s[is_used])
+
+
+@pytest.mark.parametrize("rounding_a", [0.0, 0.004])
+def test_the_missing_sign_is_that_of_the_smaller_currents(rounding_a: float) -> None:
+    sizes = np.array([3.0, 1.0, -rounding_a])
+    assert missing_sign(sizes) == "negative"
+    assert missing_sign(-sizes) == "positive"
