@@ -31,7 +31,7 @@ from daq.errors import AuditUnusable, ExitCode, UsageError
 from daq.files import sha256
 from daq.ledger.audit import AuditAction, read, verify
 from daq.report.proposal import change_table
-from daq.writeback.judgement import NOTHING, Spread
+from daq.writeback.judgement import NO_HISTORY, HistoryFigures
 from daq.writeback.request import GainChange
 from ident.calibration import Calibration
 from ident.drift.change import DISPERSION
@@ -546,7 +546,7 @@ def _change(axis: str, current_gain: float, new: float, std: float) -> GainChang
     return GainChange(axis, axis, 1, current_gain, new, std, "Nm/A", current_gain, "")
 
 
-def significant(changes: tuple[GainChange, ...], known: Spread = NOTHING) -> set[str]:
+def significant(changes: tuple[GainChange, ...], known: HistoryFigures = NO_HISTORY) -> set[str]:
     """Axes whose change is marked as more than noise in the table that the operator reads."""
     shown = io.StringIO()
     console = Console(file=shown, width=120)
@@ -565,7 +565,7 @@ def test_what_is_significant_is_a_matter_of_sigma_not_of_per_cent() -> None:
     # 2.5 % are 3.5 σ of the new gain alone, and 2.5 σ where the current gain is as uncertain.
     middle = _change("J4", 10.0, 10.25, 0.07)
     assert significant((middle,)) == {"J4"}
-    known = Spread({"J4": 0.07})
+    known = HistoryFigures({"J4": 0.07})
     assert significant((middle,), known) == set()
 
 

@@ -47,7 +47,7 @@ from daq.workflow.full_choice import ChosenBy
 from daq.workflow.live_prediction import RecentCurrent
 from daq.workflow.monitor import CellPrediction, WatchedCell
 from daq.workflow.validate import DataUse
-from daq.writeback.judgement import NOTHING
+from daq.writeback.judgement import NO_HISTORY
 from daq.writeback.request import GainChange
 from drivers.stream.monitor import AxisReading, CellReading, ReadingSource
 from ident.calibration import Gain
@@ -426,7 +426,7 @@ def _changes(cell: Cell, _: KnownHistory) -> Iterator[RenderableType]:
             "1",
         )
         changes.append(change)
-    yield proposal.change_table(tuple(changes), NOTHING)
+    yield proposal.change_table(tuple(changes), NO_HISTORY)
 
 
 @example_of("paper_tables.view")

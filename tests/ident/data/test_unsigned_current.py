@@ -146,7 +146,7 @@ def test_samples_that_are_no_use_do_not_hide_a_size(small_truth: Truth, runs: li
 
 
 def test_a_gap_after_the_first_sample_does_not_hide_a_size() -> None:
-    time_s = 0.002 * np.arange(5000)
+    time_s = np.linspace(0.0, 9.998, 5000)
     absolute_current = np.abs(3.0 * np.sin(2.0 * np.pi * 0.7 * time_s))
     is_used = np.ones(len(time_s), dtype=np.bool_)
     is_used[1:200] = False
