@@ -328,11 +328,10 @@ def _urdf(cell: Cell, _: KnownHistory) -> Iterator[RenderableType]:
     mechanics = SimpleNamespace(joints=(), closures=())
     drive_train = SimpleNamespace(coupled=())
     model = SimpleNamespace(robot=mechanics, drive_train=drive_train, columns=())
-    parameters = SimpleNamespace(torque_change_percent=ERROR, exact=True, model=model)
-    robot = SimpleNamespace(parameters=parameters)
     choice: Any = SimpleNamespace(
-        robot=robot,
         model=model,
+        exact=True,
+        torque_change_percent=ERROR,
         chosen_by=ChosenBy.NEAREST_BODIES,
         assumed=(),
     )
