@@ -580,9 +580,13 @@ class CanopenNetwork:
             if decode(statusword) is State.FAULT:
                 raise StateRefused(axis, "fault reset", str(State.FAULT), statusword)
 
-    def begin_stop(self, axes: Sequence[Axis]) -> None:
+    def begin_stop(self, axes: Sequence[Axis]) -> int:
         """Request quick stop by SDO of all these axes;
         `disable`, which waits for each, reports failures.
+
+        Returns:
+            Time by the network's clock until which the ramps of these axes may take [ns]; they
+            brake at the same time.
         """
         for axis in axes:
             access = self.objects(axis)
@@ -591,33 +595,48 @@ class CanopenNetwork:
                 self.see(axis, state)
                 if state not in POWERLESS:
                     access.write(CONTROLWORD, next_command(state, Goal.QUICK_STOP))
+        return self.link.clock() + self._disable_ns
 
-    def disable(self, axis: Axis, goal: Goal = Goal.QUICK_STOP) -> None:
+    @property
+    def _disable_ns(self) -> int:
+        return round(self.bounds.disable_s * 1e9)
+
+    def disable(
+        self, axis: Axis, goal: Goal = Goal.QUICK_STOP, ramp_end_ns: int | None = None
+    ) -> None:
         """Quick stop one axis by SDO, then remove its power, and confirm both by its statusword.
 
         Args:
             axis: to disable.
             goal: SWITCH_ON_DISABLED removes the power of an axis that is known to stand still,
                 without quick stop.
+            ramp_end_ns: until which a quick stop that was requested before may take, as of
+                `begin_stop`; None where it is requested now.
 
         Raises:
             StateRefused: not reached within ``bounds.disable_s``.
             ObjectAccessError: it does not answer.
         """
         access = self.objects(axis)
-        deadline = self.link.clock() + round(self.bounds.disable_s * 1e9)
+        end_ns = self.link.clock() + self._disable_ns
         while True:
-            state = decode(statusword := access.read(STATUSWORD))
+            statusword = access.read(STATUSWORD)
+            state = decode(statusword)
             self.see(axis, state)
             if state in POWERLESS:
                 return
-            if self.link.clock() >= deadline:
-                if goal is Goal.SWITCH_ON_DISABLED:
-                    raise StateRefused(axis, str(State.SWITCH_ON_DISABLED), str(state), statusword)
-                # The ramp did not end by itself: some drives stay in QUICK STOP ACTIVE (605Ah =
-                # 5..8).
-                goal = Goal.SWITCH_ON_DISABLED
-                deadline += round(self.bounds.disable_s * 1e9)
+            now_ns = self.link.clock()
+            is_over = now_ns >= end_ns
+            if goal is Goal.QUICK_STOP:
+                if state is State.QUICK_STOP_ACTIVE and ramp_end_ns is not None:
+                    is_over = now_ns >= ramp_end_ns
+                if is_over:
+                    # The ramp did not end by itself: some drives stay in QUICK STOP ACTIVE (605Ah =
+                    # 5..8).
+                    goal = Goal.SWITCH_ON_DISABLED
+                    end_ns = now_ns + self._disable_ns
+            elif is_over:
+                raise StateRefused(axis, str(State.SWITCH_ON_DISABLED), str(state), statusword)
             access.write(CONTROLWORD, next_command(state, goal))
             self.link.pass_time()
 
@@ -647,9 +666,9 @@ class CanopenNetwork:
             silent.add_note(_unrestored([axis for axis in axes if axis.node_id in silent.node_ids]))
             problems.append(silent)
             axes = [axis for axis in axes if axis.node_id not in silent.node_ids]
-        self.begin_stop(axes)
+        ramp_end_ns = self.begin_stop(axes)
         for axis in axes:
-            _try_to_close(partial(self.disable, axis), problems)
+            _try_to_close(partial(self.disable, axis, ramp_end_ns=ramp_end_ns), problems)
         since_ns = self.link.clock()
         for axis in axes:
             stop_pdos = partial(

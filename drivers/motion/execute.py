@@ -8,6 +8,7 @@ that all axes start on the same SYNC.
 from __future__ import annotations
 
 from collections.abc import Generator, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 from drivers.canopen.bus import base_frame
@@ -30,7 +31,7 @@ from drivers.errors import (
     node_label,
     text_of,
 )
-from drivers.messages import EventKind, Sample
+from drivers.messages import CellEvent, EventKind, Sample
 from drivers.move import MotionPermission, Move, check_moves
 from drivers.profiles.cia402 import (
     CONTROL_CHANGE_IMMEDIATELY,
@@ -51,6 +52,8 @@ from drivers.stream.watch import FrozenData
 
 #: Cycles in which a controlword is sent with every SYNC; after them with every tenth
 _URGENT_CYCLES = 10
+#: Behind which a stop by SDO still begins on the buses that are left
+_FAILURES_OF_A_STOP = 3
 _NEW_SETPOINT = ControlCommand.ENABLE_OPERATION | CONTROL_NEW_SETPOINT | CONTROL_CHANGE_IMMEDIATELY
 
 
@@ -126,7 +129,7 @@ def execute(
         # without yielding.
         with network.block_signals():
             try:
-                execution.report(None, EventKind.ENDED, 0, _cause(error))
+                execution.report_end(error)
                 for _ in execution.stop():
                     pass
             except BaseException as cut:
@@ -134,6 +137,7 @@ def execute(
                 raise
             if not execution.problems:
                 network.unguard()
+                network.end_closing()
         execution.note_failures(error)
         raise
     execution.raise_failures()
@@ -184,6 +188,8 @@ class _Execution:
         self._nodes = network.axes
         self._axes = range(len(network.axes))
         self._targets = list(first.position_counts)
+        #: Where the moves have the axes before the next of them, as their permission was checked
+        self._planned_counts = first.position_counts
         self._sent: list[tuple[int, int] | None] = [None] * len(network.axes)
 
     def _cycles(self, seconds: float) -> int:
@@ -209,12 +215,27 @@ class _Execution:
             base_frame(cob_id, data) for cob_id, data in self._pdos[axis].payloads(values)
         ]
 
-    def report(self, axis: int | None, kind: EventKind, code: int, text: str) -> None:
-        """Emit an event of a stop, which goes on where the event cannot be logged or shown."""
+    @contextmanager
+    def _events_may_fail(self) -> Iterator[None]:
+        """Go on where an event, of the stream as well, cannot be logged or shown."""
+        emit = self._bus.emit
+
+        def emit_guarded(event: CellEvent) -> None:
+            try:
+                emit(event)
+            except Exception as failure:  # noqa: BLE001 - whatever the receiver raises, the axes are stopped first
+                self.unreported = self.unreported or failure
+
+        self._bus.emit = emit_guarded
         try:
-            self._bus.report(axis, kind, code, text)
-        except Exception as failure:  # noqa: BLE001 - whatever the receiver raises, the axes are stopped first
-            self.unreported = self.unreported or failure
+            yield
+        finally:
+            self._bus.emit = emit
+
+    def report_end(self, cause: BaseException) -> None:
+        """Report why the moves end before the last one."""
+        with self._events_may_fail():
+            self._bus.report(None, EventKind.ENDED, 0, _cause(cause))
 
     def note_failures(self, error: BaseException) -> None:
         """Note on the error that a stop was made for what the stop could not confirm or report."""
@@ -269,9 +290,10 @@ class _Execution:
 
     def move(self, number: int, move: Move) -> Iterator[Sample]:
         """Make one move of all axes with a distance to go, and the dwell after it."""
-        start = tuple(self._targets)
-        moving = [axis for axis in self._axes if move.target_counts[axis] != start[axis]]
+        moving = self._moved_by(move)
+        start = list(move.target_counts)
         for axis in moving:
+            start[axis] = self._targets[axis]
             # One axis a cycle: a whole set would not fit between two SYNCs of a classic bus.
             velocity = move.velocity_counts_s[axis]
             acceleration = move.acceleration_counts_s2[axis]
@@ -321,8 +343,21 @@ class _Execution:
             number,
             f"move {number} ended at {self._sample.position_counts}",
         )
+        self._planned_counts = move.target_counts
         for _ in range(move.dwell_cycles):
             yield self._checked()
+
+    def _moved_by(self, move: Move) -> tuple[int, ...]:
+        """Return the axes that a move takes elsewhere.
+
+        An axis that it leaves where the move before left it has no profile that was checked. It
+        stays where it got power, even if it had crept some counts until then.
+        """
+        moving = []
+        for axis, target in enumerate(move.target_counts):
+            if target not in (self._planned_counts[axis], self._targets[axis]):
+                moving.append(axis)
+        return tuple(moving)
 
     def _frozen(self, number: int, axis: int) -> DriveFault:
         """Report an axis whose data do not change during a move; return the fault."""
@@ -427,10 +462,16 @@ class _Execution:
     def stop(self) -> Iterator[Sample]:
         """Quick stop all axes, then remove their power;
         failures to confirm it are in `problems`.
+
+        The stop goes on where its events cannot be logged or shown.
         """
+        with self._events_may_fail():
+            yield from self._stop()
+
+    def _stop(self) -> Iterator[Sample]:
         self._bus.outgoing.clear()  # a set-point that was not sent yet must not start a move now
         self._bus.low_priority = nothing_to_send
-        self.report(None, EventKind.STOP, 0, "quick stop, then power off, on all axes")
+        self._bus.report(None, EventKind.STOP, 0, "quick stop, then power off, on all axes")
         self.problems = []
         self._network.begin_closing()
         unconfirmed = tuple(self._axes)
@@ -448,7 +489,7 @@ class _Execution:
         except DriverError as error:
             # One of several buses may have failed, or a node is misplaced: the others are stopped
             # by SDO.
-            self.report(
+            self._bus.report(
                 None, EventKind.STOP_UNCONFIRMED, 0, f"the bus ended the stop by PDO: {error}"
             )
             self.problems.append(error)
@@ -462,29 +503,32 @@ class _Execution:
         if silent is not None:
             unheard = silent.node_ids
             self.problems.append(silent)
-        self._network.begin_stop([node for node in nodes if node.node_id not in unheard])
+        heard = [node for node in nodes if node.node_id not in unheard]
+        ramp_end_ns = self._network.begin_stop(heard)
         for axis, node in zip(unconfirmed, nodes, strict=True):
             try:
                 if node.node_id not in unheard:
-                    self._network.disable(node)
+                    self._network.disable(node, ramp_end_ns=ramp_end_ns)
                     continue
                 text = f"{node_label(node)} does not answer: its standstill is not confirmed"
             except DriverError as error:
                 text = str(error)
                 self.problems.append(error)
-            self.report(axis, EventKind.STOP_UNCONFIRMED, self._sample.statusword[axis], text)
+            self._bus.report(axis, EventKind.STOP_UNCONFIRMED, self._sample.statusword[axis], text)
 
     def _find_silent(self, nodes: Sequence[Axis]) -> NodeMissing | None:
         """Return the error for the nodes that do not answer; None where all do.
 
-        A failure of one of several buses is raised once, and then the others go on. After such a
-        failure the nodes are asked again, so that those of the other buses are stopped.
+        A failure of one of several buses, or a misplaced node, is raised once, and then the others
+        go on. So the nodes are asked again after a failure, and those of the other buses stopped.
         """
-        try:
-            return self._network.find_silent(nodes)
-        except DriverError as error:
-            self.report(None, EventKind.STOP_UNCONFIRMED, 0, f"the bus ended the stop: {error}")
-            self._add_problem(error)
+        for _ in range(_FAILURES_OF_A_STOP):
+            try:
+                return self._network.find_silent(nodes)
+            except DriverError as error:
+                text = f"the bus ended the stop: {error}"
+                self._bus.report(None, EventKind.STOP_UNCONFIRMED, 0, text)
+                self._add_problem(error)
         return self._network.find_silent(nodes)
 
     def _add_problem(self, error: DriverError) -> None:

@@ -202,6 +202,44 @@ def test_an_axis_that_stays_in_quick_stop_is_without_power_afterwards() -> None:
     assert statusword & 0x6F == 0x40
 
 
+def test_axes_that_stay_in_quick_stop_are_waited_for_together() -> None:
+    """Their ramps run at the same time: one after the other would take longer than a closing
+    network has.
+    """
+    network, bus = cell(5)
+    with network:
+        network.prepare()
+        for node in bus.nodes:
+            node.quick_stop_stays = True
+            for command in (6, 7, 15):
+                node.control(command, 0)
+        begin_ns = bus.clock()
+        ramp_end_ns = network.begin_stop(network.axes)
+        for axis in network.axes:
+            network.disable(axis, ramp_end_ns=ramp_end_ns)
+        took_s = (bus.clock() - begin_ns) * 1e-9
+    states = [node.statusword & 0x6F for node in bus.nodes]
+    assert states == [0x40] * 5
+    assert took_s < 2 * network.bounds.disable_s
+
+
+def test_an_axis_whose_quick_stop_had_no_effect_gets_its_own_time_for_the_ramp() -> None:
+    network, bus = cell(1)
+    (node,) = bus.nodes
+    with network:
+        network.prepare()
+        for command in (6, 7, 15):
+            node.control(command, 0)
+        node.quick_stop_stays = True
+        over_ns = bus.clock() - 1
+        begin_ns = bus.clock()
+        network.disable(network.axes[0], ramp_end_ns=over_ns)
+        written = [frame.data[4] for frame in bus.sent if frame.data[1:3] == b"\x40\x60"]
+        took_s = (bus.clock() - begin_ns) * 1e-9
+    assert written[-2] & 0x0F == 0x02  # quick stop, before its power is taken
+    assert took_s < 2 * network.bounds.disable_s
+
+
 def test_a_missing_node_is_named_with_those_that_answered() -> None:
     clock = FakeClock()
     nodes = (ScriptedNode(1),)

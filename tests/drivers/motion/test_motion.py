@@ -125,6 +125,37 @@ def test_the_time_limit_of_a_stop_ends_with_a_stop_that_is_confirmed(moving: Mov
     assert network.link.allowed_s(3600.0) == 3600.0
 
 
+def test_the_time_limit_of_a_stop_after_an_error_ends_with_it_as_well(moving: Moving) -> None:
+    """Settings are restored with a limit of their own, after a log on a slow disk is closed."""
+    network, _, bus, _ = moving
+    bus.nodes[1].ignores_setpoint = True
+    with pytest.raises(MotionTimeout):
+        run(moving, FAR)
+    assert powerless(bus)
+    assert network.link.allowed_s(3600.0) == 3600.0
+
+
+def test_an_axis_that_creeps_before_it_has_power_stays_where_the_moves_leave_it(
+    moving: Moving,
+) -> None:
+    """It was checked without a profile for those counts, and would take a second for each."""
+    _, _, bus, _ = moving
+
+    def creep(cycle: int) -> None:
+        if cycle == 1:
+            bus.nodes[1].position = 7.0
+
+    bus.on_cycle = creep
+    of_first_axis = Move((5_000, 0), (100_000, 1), (1_000_000, 1))
+    back = Move((0, 0), (100_000, 1), (1_000_000, 1))
+    of_both = Move((5_000, -5_000), (100_000, 100_000), (1_000_000, 1_000_000))
+    samples = run(moving, of_first_axis, back, of_both)
+    assert [sample.position_counts[1] for sample in samples][5:100] == [7] * 95
+    assert samples[-1].position_counts == (5_000, -5_000)
+    assert setpoint_counts(bus) == [3, 1]
+    assert len(samples) * PERIOD_NS < 2_000_000_000
+
+
 def test_the_profile_objects_are_those_of_the_move(moving: Moving) -> None:
     _, _, bus, _ = moving
     run(moving, FAR)
@@ -478,7 +509,7 @@ def test_every_axis_that_could_not_be_stopped_is_reported(
     for node in bus.nodes:
         node.quick_stop_stays = True
 
-    def refuse(axis: Axis) -> None:
+    def refuse(axis: Axis, ramp_end_ns: int) -> None:
         raise StateRefused(axis.node_id, "SWITCH ON DISABLED", "QUICK STOP ACTIVE", 0x07)
 
     def coast(_cycle: int) -> None:
@@ -534,13 +565,14 @@ def test_a_stop_that_cannot_be_said_is_noted_on_the_error(moving: Moving) -> Non
 class FullSink:
     """A receiver of events that takes none of a stop from a moment on, as a log on a full disk."""
 
-    KINDS = (EventKind.ENDED, EventKind.STOP, EventKind.STOP_UNCONFIRMED)
-
     def __init__(self) -> None:
         self.full = False
+        self._stops = False
 
     def __call__(self, event: CellEvent) -> None:
-        if self.full and event.kind in self.KINDS:
+        if event.kind in (EventKind.ENDED, EventKind.STOP):
+            self._stops = True
+        if self.full and self._stops:
             raise ValueError("the log takes no event")
 
 
@@ -645,7 +677,7 @@ def test_amplifiers_that_were_not_seen_to_stop_go_on_watching_us(
 ) -> None:
     network, _, bus, events = moving
 
-    def refuse(axis: Axis) -> None:
+    def refuse(axis: Axis, ramp_end_ns: int) -> None:
         raise StateRefused(axis.node_id, "SWITCH ON DISABLED", "OPERATION ENABLED", 0x27)
 
     def deaf(cycle: int) -> None:
@@ -674,9 +706,9 @@ def test_what_is_stopped_by_sdo_is_reported_before_one_is_waited_for(
     disable = network.disable
     reported = []
 
-    def note(axis: Axis) -> None:
+    def note(axis: Axis, ramp_end_ns: int) -> None:
         reported.append([node.statusword & 0x6F for node in bus.nodes])
-        disable(axis)
+        disable(axis, ramp_end_ns=ramp_end_ns)
 
     def deaf(_cycle: int) -> None:
         if EventKind.STOP in [event.kind for event in events] and not reported:
@@ -741,3 +773,33 @@ def test_a_second_failure_during_a_stop_does_not_keep_the_axes_from_being_stoppe
         run(moving, both_by(5_000))
     assert powerless(bus)
     assert str(bus_off) in " ".join(stopped.value.__notes__)
+
+
+def test_axes_of_a_good_bus_are_stopped_behind_three_failures(
+    moving: Moving, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    network, _, bus, events = moving
+    find_silent = network.find_silent
+    failures = [
+        BusError("bus B", "bus-off"),
+        BusError("bus C", "no answer"),
+        NodeMisplaced(9, "A", "B"),
+    ]
+
+    def fail_by_pdo(_cycle: int) -> None:
+        if EventKind.STOP in [event.kind for event in events]:
+            bus.on_cycle = lambda _cycle: None
+            raise failures.pop()
+
+    def fail_twice(axes: Sequence[Axis]) -> NodeMissing | None:
+        if failures:
+            raise failures.pop()
+        assert bus.nodes[0].statusword & 0x6F not in NO_POWER
+        return find_silent(axes)
+
+    bus.on_cycle = fail_by_pdo
+    with monkeypatch.context() as patched:
+        patched.setattr(network, "find_silent", fail_twice)
+        with pytest.raises(NodeMisplaced):
+            run(moving, FAR)
+    assert powerless(bus)
