@@ -86,8 +86,8 @@ class Bounds:
     #: than `guard_ms` of a cell whose SYNC has a usual period: a slower heartbeat could not replace
     #: the recorder's.
     free_s: float = 0.35
-    #: For everything from the stop of the axes to the last restored setting. The stop comes first;
-    #: whatever is not restored by then is named.
+    #: For the stop of the axes and the settings that are restored behind it; whatever is not
+    #: restored by then is named. Where the stop is confirmed, the settings have this time anew.
     closing_s: float = 10.0
 
 
