@@ -197,13 +197,11 @@ class DriveProducer(Producer, AbstractContextManager["DriveProducer"]):
         self._produces = False
 
     def __exit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
-        try:
-            if error is not None:
-                self._network.begin_closing()
+        if error is None:
             self.stop()
-        except DriverError as problem:
-            if error is None:
-                raise
+            return
+        self._network.begin_closing()
+        for problem in self._restore():
             error.add_note(f"{WHILE}stopping SYNC: {problem}")
 
     def start(self) -> None:
@@ -235,20 +233,47 @@ class DriveProducer(Producer, AbstractContextManager["DriveProducer"]):
             self._produces = False
 
     def stop(self) -> None:
-        """Restore both objects, if started and if the drive still answers."""
+        """Restore both objects, if started and if the drive still answers.
+
+        Raises:
+            DriverError: an object could not be restored. A note names the other one, where that
+                could not be restored either.
+        """
+        problems = self._restore()
+        if problems:
+            first, *others = problems
+            for other in others:
+                first.add_note(f"{WHILE}stopping SYNC: {other}")
+            raise first
+
+    def _restore(self) -> list[DriverError]:
+        """Restore both objects, as `stop`; return a problem for each that could not be restored."""
         before = self._before
         self._before = None
         self._produces = False
         try:
-            if before is not None and self._node_id not in self._network.link.silent:
-                access = self._network.link.objects(self._node_id)
-                # Production ends first, and another identifier comes back in a write of its own.
-                access.write(SYNC_COB_ID_OBJECT, SYNC_COB_ID)
-                access.write(CYCLE_PERIOD, before.period_us)
-                if before.cob_id != SYNC_COB_ID:
-                    access.write(SYNC_COB_ID_OBJECT, before.cob_id)
+            if before is None or self._node_id in self._network.link.silent:
+                return []
+            return self._write_back(before)
         finally:
             self._network.link.sync_producer = None
+
+    def _write_back(self, before: _SyncObjects) -> list[DriverError]:
+        """Write both objects, also where one is refused; return a problem for each that was."""
+        # Production ends first, and another identifier comes back in a write of its own.
+        writes = [(SYNC_COB_ID_OBJECT, SYNC_COB_ID), (CYCLE_PERIOD, before.period_us)]
+        if before.cob_id != SYNC_COB_ID:
+            writes.append((SYNC_COB_ID_OBJECT, before.cob_id))
+        access = self._network.link.objects(self._node_id)
+        problems: dict[ObjectEntry, DriverError] = {}  # of the last write of each object
+        for entry, value in writes:
+            try:
+                access.write(entry, value)
+            except DriverError as problem:
+                problems[entry] = problem
+            else:
+                problems.pop(entry, None)
+        return list(problems.values())
 
 
 SyncProducer = KernelProducer | DriveProducer
