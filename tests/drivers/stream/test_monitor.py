@@ -362,6 +362,37 @@ def test_an_aborted_object_is_named_until_it_is_given(
     assert axis.statusword == 0x250
 
 
+@pytest.mark.parametrize("refused_index", [POSITION_INDEX, STATUSWORD_INDEX])
+def test_an_axis_that_refuses_an_object_is_missing_with_its_last_values(
+    bus: QuietBus, monkeypatch: pytest.MonkeyPatch, refused_index: bytes
+) -> None:
+    samples: list[Sample] = []
+    monitor = monitor_of(bus, samples)
+    aborting: list[int] = []
+
+    def reply(node: int, data: bytes) -> bytes:
+        if data[1:3] == refused_index and node in aborting:
+            return b"\x80" + data[1:4] + bytes.fromhex("22000008")
+        return value_reply(data, 0x237)
+
+    monitor.watch(QUIET_S)
+    answer_all(bus, monkeypatch, reply)
+    monitor.watch(1.0)
+    assert samples[-1].missing == 0
+    samples.clear()
+    aborting.append(2)
+    reading = monitor.watch(4 * READING_S)
+    assert reading.axes[1].refused
+    # The first sample may be of the values before the refusal.
+    assert {sample.missing for sample in samples[1:]} == {0b10}
+    for sample in samples:
+        assert sample.position_counts == (0x237,) * 6
+        assert sample.statusword == (0x237,) * 6
+    aborting.clear()
+    monitor.watch(3 * READING_S)
+    assert samples[-1].missing == 0
+
+
 def test_heartbeats_and_emergencies_of_axes_are_reported(bus: QuietBus) -> None:
     monitor = monitor_of(bus)
     receive(bus, 0x702, b"\x05", after_ns=1000)
