@@ -7,8 +7,9 @@ the order of their time stamps, which all interfaces take from clocks of this co
 where all have such stamps, else wall time. Where all have such stamps, our own SYNC comes when it
 has been received from every bus: all frames that arrived on their bus before it have come by then.
 
-A bus that fails is reported once, as a BusError with its name. The others go on, so that their axes
-can be stopped and restored; the nodes of the failed bus are silent from then on.
+A bus that fails is reported once, as a BusError with its name; buses that fail while one burst is
+sent, as one BusError with all their names. The others go on, so that their axes can be stopped and
+restored; the nodes of the failed bus are silent from then on.
 """
 
 from __future__ import annotations
@@ -206,8 +207,8 @@ class SplitBus(can.BusABC):
         """Send several frames in their order; consecutive frames of one bus go there in one call.
 
         A frame for all buses goes to one right after the other, when everything before it has been
-        sent: this keeps the SYNCs close together. A bus that fails raises BusError after the others
-        got their frames.
+        sent: this keeps the SYNCs close together. Buses that fail raise one BusError with all their
+        names, after the others got their frames.
         """
         failures: list[BusError] = []
         for route, group in groupby(messages, self.address.route):
@@ -218,7 +219,7 @@ class SplitBus(can.BusABC):
                 for frame in frames:
                     failures += self._send_to(route, (frame,))
         if failures:
-            raise failures[0]
+            raise _joined(failures)
         self._require_one()
 
     def _send_to(self, route: Sequence[int], frames: Sequence[can.Message]) -> list[BusError]:
@@ -390,7 +391,18 @@ class SplitBus(can.BusABC):
             except _FAILURES as error:
                 failures.append(self._fail(index, error))
         if failures:
-            raise failures[0]
+            raise _joined(failures)
+
+
+def _joined(failures: Sequence[BusError]) -> BusError:
+    """Return one error with the names and reasons of all buses that failed."""
+    first, *others = failures
+    if not others:
+        return first
+    reason = "; ".join([first.reason, *map(str, others)])
+    joined = BusError(first.address, reason)
+    joined.__cause__ = first.__cause__
+    return joined
 
 
 def _arrival_times(waiting: Sequence[tuple[can.Message, int]]) -> list[tuple[float, int]]:
