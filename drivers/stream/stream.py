@@ -273,7 +273,9 @@ class SyncStream:
         """Count an answer after the last cycle; `in_cycle` after another SYNC."""
         if not in_cycle:
             self._process_between_cycles(message)
-        elif len(message.data) == slot.length:
+        elif len(message.data) != slot.length:
+            self._note_length(slot, message.arbitration_id, len(message.data))
+        else:
             self._answers.take(message.arbitration_id, slot, message.data)
 
     def _process_between_cycles(self, message: can.Message) -> None:
@@ -283,6 +285,8 @@ class SyncStream:
             self._process_other(message)
         elif self.bus.cycles == 0:
             self._counts["foreign"] += 1
+        elif len(message.data) != slot.length:
+            self._note_length(slot, message.arbitration_id, len(message.data))
         else:
             self._answers.take_between(slot)
 
