@@ -104,6 +104,7 @@ class _AxisWatch:
         self.last_values = [0] * len(self.entries)  # also after a refusal; 0 before the first
         self.answered: set[int] = set()  # COB-IDs of the answers to the last SYNC
         self.has_answered = False  # whether an earlier SYNC was answered completely
+        self.in_set: set[int] = set()  # COB-IDs of the overheard set that is not complete
         self.sets = 0  # complete ones since the last `take`
         self.lost = 0  # SYNCs or requests without an answer
         self.complete_ns: int | None = None  # when the last complete set by SDO came
@@ -159,8 +160,10 @@ class _AxisWatch:
         for column, value in zip(slot.columns, slot.layout.unpack(data), strict=True):
             self._note_value(column, value)
         self.answered.add(cob_id)
-        if self.is_complete:
+        self.in_set.add(cob_id)
+        if self.in_set == self.slots.keys():
             self.sets += 1
+            self.in_set.clear()
 
     def hear_sync(self) -> None:
         """End the time for answers to the SYNC before.
@@ -172,6 +175,7 @@ class _AxisWatch:
         elif self.has_answered:
             self.lost += 1
         self.answered.clear()
+        self.in_set.clear()
 
     def hear_answer(self, data: bytes, now_ns: int) -> None:
         """Take an SDO answer to the open request, however late it comes."""

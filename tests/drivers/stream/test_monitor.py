@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 import can
 import pytest
@@ -25,7 +26,7 @@ from drivers.stream.monitor import (
     ReadingSource,
 )
 from tests.drivers.quiet_bus import QuietBus, frame, overheard_cycle
-from tests.drivers.scripted import FakeClock
+from tests.drivers.scripted import PROFILE, FakeClock
 
 NUMBERS = range(1, 7)
 AXES = tuple(Axis(f"J{number}", number) for number in NUMBERS)
@@ -257,6 +258,19 @@ def test_a_frame_of_another_mapping_is_no_value(bus: QuietBus) -> None:
     assert axis.current_raw is None
     assert axis.statusword is None
     assert axis.rate_hz == 0.0
+
+
+def test_a_set_of_two_frames_counts_when_both_came_also_without_sync(bus: QuietBus) -> None:
+    wide = replace(PROFILE, current=ObjectEntry(0x2077, 0, 32, signed=True))
+    axis = Axis("J1", 1, wide)
+    monitor = CellMonitor(link(bus), (axis,))
+    for cycle in range(20):
+        after_ns = (cycle + 1) * 10_000_000
+        receive(bus, 0x181, bytes(8), after_ns)
+        receive(bus, 0x281, bytes(2), after_ns + 1000)
+    reading = monitor.watch(0.5)
+    assert first_axis(reading).position_counts == 0
+    assert first_axis(reading).rate_hz == pytest.approx(20 / 0.5)
 
 
 def test_queried_values_are_samples_with_wall_time_ten_times_a_second(
