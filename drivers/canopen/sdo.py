@@ -1,4 +1,9 @@
-"""SDO access that reads the bus itself, retries, and never accepts an old answer for a new one."""
+"""SDO access that reads the bus itself, retries, and takes no answer about another object.
+
+A late answer about the same object cannot be told from the answer to the present request: CiA 301
+has a toggle bit in segments alone, and an abort is not confirmed. Whatever must be certain is read
+back after it was written.
+"""
 
 from __future__ import annotations
 
@@ -229,7 +234,9 @@ class SynchronousSdoClient(SdoClient):
         self._policy = policy
         # Answer to the last request; empty where a second answer is no sign of a second device.
         self._answered = b""
-        # Objects whose request was given up, by index and sub-index: its answer may still come.
+        self._is_waiting = False  # for an answer
+        # Objects whose request was given up, by index and sub-index: its answer may still come, and
+        # is no sign of a second device.
         self._unanswered: set[bytes] = set()
 
     def upload(self, index: int, subindex: int) -> bytes:
@@ -284,7 +291,8 @@ class SynchronousSdoClient(SdoClient):
         """Accept an answer that was read from the bus; CiA 301: an SDO always has eight bytes."""
         if len(data) == 8:
             self._note_surplus(self._answered, bytes(data))
-            self.responses.put(bytes(data))
+            if self._is_waiting:
+                self.responses.put(bytes(data))
 
     def send_request(self, request: bytes) -> None:
         """Send a request; a failing bus raises BusError."""
@@ -307,11 +315,15 @@ class SynchronousSdoClient(SdoClient):
 
     def _read_until(self, deadline_ns: int) -> bytes:
         """Return the next answer; SdoCommunicationError where none comes by then."""
-        while self.responses.empty():
-            left_s = (deadline_ns - self._bus.clock()) * 1e-9
-            if left_s <= 0:
-                raise SdoCommunicationError(f"no answer within {self._policy.timeout_s:g} s")
-            self._bus.pump(left_s)
+        self._is_waiting = True
+        try:
+            while self.responses.empty():
+                left_s = (deadline_ns - self._bus.clock()) * 1e-9
+                if left_s <= 0:
+                    raise SdoCommunicationError(f"no answer within {self._policy.timeout_s:g} s")
+                self._bus.pump(left_s)
+        finally:
+            self._is_waiting = False
         response: bytes = self.responses.get_nowait()
         return response
 
@@ -319,6 +331,7 @@ class SynchronousSdoClient(SdoClient):
         """Send a request and return the answer that belongs to it, or raise SdoAbortedError,
         SdoCommunicationError.
         """
+        # What came before the request does not answer it; after an interrupt, one may be stored.
         self._bus.pump(0.0)
         self.responses.queue.clear()
         last_answer = self._answered
