@@ -186,6 +186,9 @@ def _read_rated(access: ObjectAccess, profile: DriveProfile) -> _RatedValues:
     else:
         torque_raw = access.read_optional(rated.torque)
         missing = f"drive reports no rated torque ({rated.torque})"
+    if torque_raw is not None and torque_raw < 0:
+        missing = f"drive reports a rated torque below zero ({rated.torque} = {torque_raw})"
+        torque_raw = None
     if not torque_raw:
         warning = (
             f"{missing}; the torque constant cannot be checked (no gain depends on this)"
