@@ -38,7 +38,7 @@ class ReadingSource(Enum):
     """Origin of the readings."""
 
     OVERHEARD = "overheard"  #: answers to the SYNC of another master
-    ASKED = "asked"  #: SDO uploads of our own
+    ASKED = "asked"  #: SDO uploads of our own, where no other master is on the bus
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,7 +130,7 @@ class _AxisWatch:
         """
         position, current, statusword = self.values
         lasted_s = max((now_ns - since_ns) * 1e-9, 1e-9)
-        # An axis that sent nothing since then is silent.
+        # An axis is silent that sent nothing since the last reading, and for at least ABANDONED_S.
         silent_since_ns = min(since_ns, now_ns - round(ABANDONED_S * 1e9))
         refused = [self.refused[column] for column in sorted(self.refused)]
         delay_s = None
@@ -196,6 +196,7 @@ class _AxisWatch:
             self.refused[column] = ObjectRefusal(entry, answer.abort_code)
         else:
             self._note_value(column, answer.value)
+        # An axis that refuses an object has no complete set.
         is_last = column == len(self.entries) - 1
         if is_last and not self.refused:
             self.sets += 1
@@ -381,6 +382,8 @@ class CellMonitor:
     def _note_master(self) -> None:
         """Note that another master uses the bus, or is about to."""
         if self.source is ReadingSource.ASKED:
+            # The axes answer to its SYNC from now on; missing answers count as lost once the first
+            # has come.
             self.pause()
             for axis in self._axes:
                 axis.has_answered = False
@@ -404,10 +407,12 @@ class CellMonitor:
 
     def _sample_asked(self, now_ns: int) -> None:
         """Make a sample of the last values, if it is due."""
+        # The last SYNC of a master that is gone gets no sample.
         self._last_sync = None
         if now_ns < self._next_sample_ns:
             return
         self._next_sample_ns = now_ns + round(READING_S * 1e9)
+        # A set begins every READING_S, and its answers may take ANSWER_S; the rest is a margin.
         oldest_ns = now_ns - round((2 * READING_S + ANSWER_S) * 1e9)
         missing = []
         for axis in self._axes:
