@@ -22,8 +22,8 @@ LARGEST_RATED_A = 1000.0
 MIN_STEPS = 20.0
 #: Ratio of two torque constants that tolerances of Kt and a gear's efficiency explain
 LARGEST_KT_RATIO = 1.25
-#: Ratio to √2 or 1/√2 that is still taken for peak and RMS ampere
-_LARGEST_AMPLITUDE_RATIO = 1.08
+#: Two torque constants whose ratio is √2 or 1/√2, up to this factor, count in peak and RMS ampere
+_AMPLITUDE_TOLERANCE = 1.08
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +32,7 @@ class _RatedValues:
 
     current_a: float | None  #: None where the drive reports none
     torque_nm: float | None  #: None where the drive reports none
-    warnings: tuple[str, ...]  #: what cannot be checked without them
+    warnings: tuple[str, ...]  #: checks that values which are not reported make impossible
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,32 +127,32 @@ def read_scale(access: ObjectAccess, profile: DriveProfile) -> ScaleReading:
 def check_nameplate(
     reading: ScaleReading, amplitude: Amplitude, motor_nm_per_a: float
 ) -> tuple[str, ...]:
-    """Compare the drive's Kt = rated torque / rated current with that of the nameplate,
-    |nameplate gain / N|.
+    """Compare the drive's Kt = rated torque / rated current with that of the nameplate.
 
     Args:
         reading, amplitude: of the drive, and of its profile.
-        motor_nm_per_a: torque constant of the motor by the nameplate [Nm/A], sign irrelevant.
+        motor_nm_per_a: torque constant of the motor by the nameplate [Nm/A]: nameplate gain / gear
+            ratio; its sign does not matter.
 
     Returns:
-        Warnings for a poor fit; none where the drive does not report both values, of which the
-        reading warns.
+        Warnings for a poor fit. None where the drive does not report both values: `reading` has a
+        warning of that.
     """
     reported = reading.torque_constant_nm_per_a
-    declared = abs(motor_nm_per_a)
+    nameplate_nm_per_a = abs(motor_nm_per_a)
     if reported is None:
         return ()
-    ratio = reported / declared
+    ratio = reported / nameplate_nm_per_a
     if 1.0 / LARGEST_KT_RATIO < ratio < LARGEST_KT_RATIO:
         return ()
     evidence = (
         f"{reported:.4g} Nm/A by the drive ({reading.rated_torque_nm:g} Nm / "
-        f"{reading.rated_current_a:g} A), {declared:.4g} Nm/A by the nameplate in the cell file, "
-        f"{ratio:.3g} times"
+        f"{reading.rated_current_a:g} A), {nameplate_nm_per_a:.4g} Nm/A by the nameplate in the "
+        f"cell file, {ratio:.3g} times"
     )
     # Peak and RMS differ by √2 or by 1/√2.
     log_distance = abs(abs(math.log(ratio)) - math.log(math.sqrt(2.0)))
-    if log_distance < math.log(_LARGEST_AMPLITUDE_RATIO):
+    if log_distance < math.log(_AMPLITUDE_TOLERANCE):
         hint = (
             "near √2: one of them counts peak and the other RMS ampere (this profile: "
             f"{amplitude.value})"
@@ -168,7 +168,8 @@ def _read_rated(access: ObjectAccess, profile: DriveProfile) -> _RatedValues:
     if rated is None:
         warning = f"profile {profile.name} has no rated current; the ampere cannot be checked"
         return _RatedValues(None, None, (warning,))
-    # A drive gives its torque in thousandths of the rated torque: without that it has no unit.
+    # A drive gives its torque in thousandths of the rated torque: without that it has no unit. Each
+    # of the warnings below says so.
     not_logged = ""
     if profile.torque is not None:
         not_logged = f", and its torque ({profile.torque}) is not logged"
@@ -181,15 +182,16 @@ def _read_rated(access: ObjectAccess, profile: DriveProfile) -> _RatedValues:
         return _RatedValues(None, None, (warning,))
     current_a = current_raw * rated.ampere_per_unit
     if rated.torque is None:
-        torque_raw = None
         missing = "no rated torque"
     else:
         torque_raw = access.read_optional(rated.torque)
-        missing = f"drive reports no rated torque ({rated.torque})"
-    if not torque_raw:
-        warning = (
-            f"{missing}; the torque constant cannot be checked (no gain depends on this)"
-            f"{not_logged}"
-        )
-        return _RatedValues(current_a, None, (warning,))
-    return _RatedValues(current_a, torque_raw * rated.newton_metre_per_unit, ())
+        if torque_raw is not None and torque_raw > 0:
+            return _RatedValues(current_a, torque_raw * rated.newton_metre_per_unit, ())
+        if torque_raw is not None and torque_raw < 0:
+            missing = f"drive reports a rated torque below zero ({rated.torque} = {torque_raw})"
+        else:
+            missing = f"drive reports no rated torque ({rated.torque})"
+    warning = (
+        f"{missing}; the torque constant cannot be checked (no gain depends on this){not_logged}"
+    )
+    return _RatedValues(current_a, None, (warning,))

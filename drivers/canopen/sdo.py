@@ -1,4 +1,9 @@
-"""SDO access that reads the bus itself, retries, and never accepts an old answer for a new one."""
+"""SDO access that reads the bus itself, retries, and takes no answer about another object.
+
+A late answer about the same object cannot be told from the answer to the present request: CiA 301
+has a toggle bit in segments alone, and an abort is not confirmed. Where a write must be certain,
+the object, or what follows from it, is read afterwards.
+"""
 
 from __future__ import annotations
 
@@ -176,7 +181,7 @@ class ObjectAccess:
 
     def _attempt(self, name: str, transfer: Callable[[], T]) -> T:
         """Return the result of a transfer, which is tried again where no answer comes."""
-        reason = ""
+        reason = ""  # for which the last attempt failed
         for _ in range(self._policy.attempts):
             if self._client.closing_is_over:
                 if not reason:
@@ -227,9 +232,12 @@ class SynchronousSdoClient(SdoClient):
         SdoClient.__init__(self, SDO_REQUEST + node_id, SDO_ANSWER + node_id, ObjectDictionary())
         self._bus = bus
         self._policy = policy
-        # Answer to the last request; empty where a second answer is no sign of a second device.
-        self._answered = b""
-        # Objects whose request was given up, by index and sub-index: its answer may still come.
+        # Bytes of the answer to the last request. Empty while a request is open, and where another
+        # answer may be a late one, which is no sign of a second device.
+        self._last_answer = b""
+        self._is_waiting = False  # for an answer
+        # Objects whose request was given up, by index and sub-index: its answer may still come, and
+        # is no sign of a second device.
         self._unanswered: set[bytes] = set()
 
     def upload(self, index: int, subindex: int) -> bytes:
@@ -250,16 +258,16 @@ class SynchronousSdoClient(SdoClient):
     def _read_whole(self, index: int, subindex: int, *, block: bool) -> bytes:
         """Read all segments of an object; see `upload`."""
         deadline_ns = self._bus.clock() + round(self._policy.transfer_s * 1e9)
-        most = self._policy.most_bytes
+        most_bytes = self._policy.most_bytes
         data = bytearray()
         open_stream: type[BlockUploadStream | ReadableStream]
         open_stream = BlockUploadStream if block else ReadableStream
         try:
             with open_stream(self, index, subindex) as stream:
                 read = cast("Callable[[int], bytes]", stream.read)
-                # The size that the node announces, or more where it sends more
+                # As the node announces it; as found, where the node sends more
                 size = stream.size or 0
-                while size <= most:
+                while size <= most_bytes:
                     segment = read(_SEGMENT_BYTES)
                     if not segment:
                         return bytes(data)
@@ -267,10 +275,12 @@ class SynchronousSdoClient(SdoClient):
                     size = max(size, len(data))
                     if self._bus.clock() >= deadline_ns:
                         break
-        except AttributeError as error:  # canopen's block transfer, where its end does not come
+        except AttributeError as error:
+            # canopen calls a method that its stream does not have, where the end of a block
+            # transfer does not come.
             raise SdoCommunicationError("the block transfer was not ended") from error
         self.abort(_ABORT_OUT_OF_MEMORY)
-        limits = f"at most {most} bytes within {self._policy.transfer_s:g} s"
+        limits = f"at most {most_bytes} bytes within {self._policy.transfer_s:g} s"
         raise TransferUnboundedError(
             f"found {size} bytes and no end, expected {limits}; the transfer was aborted"
         )
@@ -283,8 +293,9 @@ class SynchronousSdoClient(SdoClient):
     def receive(self, data: bytearray) -> None:
         """Accept an answer that was read from the bus; CiA 301: an SDO always has eight bytes."""
         if len(data) == 8:
-            self._note_surplus(self._answered, bytes(data))
-            self.responses.put(bytes(data))
+            self._note_second_answer(self._last_answer, bytes(data))
+            if self._is_waiting:
+                self.responses.put(bytes(data))
 
     def send_request(self, request: bytes) -> None:
         """Send a request; a failing bus raises BusError."""
@@ -307,11 +318,15 @@ class SynchronousSdoClient(SdoClient):
 
     def _read_until(self, deadline_ns: int) -> bytes:
         """Return the next answer; SdoCommunicationError where none comes by then."""
-        while self.responses.empty():
-            left_s = (deadline_ns - self._bus.clock()) * 1e-9
-            if left_s <= 0:
-                raise SdoCommunicationError(f"no answer within {self._policy.timeout_s:g} s")
-            self._bus.pump(left_s)
+        self._is_waiting = True
+        try:
+            while self.responses.empty():
+                left_s = (deadline_ns - self._bus.clock()) * 1e-9
+                if left_s <= 0:
+                    raise SdoCommunicationError(f"no answer within {self._policy.timeout_s:g} s")
+                self._bus.pump(left_s)
+        finally:
+            self._is_waiting = False
         response: bytes = self.responses.get_nowait()
         return response
 
@@ -319,13 +334,17 @@ class SynchronousSdoClient(SdoClient):
         """Send a request and return the answer that belongs to it, or raise SdoAbortedError,
         SdoCommunicationError.
         """
+        # What came before the request does not answer it; after an interrupt, one may be stored.
         self._bus.pump(0.0)
         self.responses.queue.clear()
-        last_answer = self._answered
-        self._answered = b""
+        # Another answer to the last request shows a second device, unless another client has sent a
+        # request to this node since.
+        last_answer = self._last_answer
+        self._last_answer = b""
         if self._bus.asked_by.get(self.tx_cobid - SDO_ANSWER) is not self:
             last_answer = b""
         self.send_request(sdo_request)
+        # Index and sub-index; a request for the next segment has other bytes there.
         requested = bytes(sdo_request[1:4])
         names_object = sdo_request[0] >> 5 in _NAMING_REQUESTS
         deadline_ns = self._deadline()
@@ -338,14 +357,15 @@ class SynchronousSdoClient(SdoClient):
             answered_object = response[1:4]
             # Some nodes abort without the index of the object.
             is_unnamed_abort = response[0] == _ABORT and answered_object == b"\0\0\0"
-            if names_object and answered_object != requested and not is_unnamed_abort:
+            is_about_another = answered_object != requested and not is_unnamed_abort
+            if names_object and is_about_another:
                 # A second answer to the last request, or a late answer to an earlier one
-                self._note_surplus(last_answer, response)
+                self._note_second_answer(last_answer, response)
                 continue
             if names_object and requested not in self._unanswered:
-                self._answered = response
+                self._last_answer = response
             else:
-                self._answered = b""
+                self._last_answer = b""
             self._unanswered.discard(requested)
             _raise_if_aborted(response)
             return response
@@ -357,8 +377,13 @@ class SynchronousSdoClient(SdoClient):
         self._unanswered.add(requested)
         self.abort()
 
-    def _note_surplus(self, first: bytes, second: bytes) -> None:
-        """Report a second answer to one request: two devices have the node id."""
+    def _note_second_answer(self, first: bytes, second: bytes) -> None:
+        """Report a second answer to one request, if it is one: two devices have the node id.
+
+        Args:
+            first: the answer to the last request; empty where no other may be compared with it.
+            second: an answer that nobody waits for, or about another object than requested.
+        """
         node_id = self.tx_cobid - SDO_ANSWER
         if first and second[1:4] == first[1:4] and self._bus.asked_by.get(node_id) is self:
             self._bus.note_twice(node_id, first, second)

@@ -63,7 +63,7 @@ class Losses(NamedTuple):
     #: Before any socket, in the controller or in the kernel's queue behind its driver (the
     #: interface's counters, which are read five times a second).
     interface: int = 0
-    backlog: int = 0  #: in the capture process, because this process did not read them for minutes
+    backlog: int = 0  #: in the capture process, because this process did not read them in time
 
     def since(self, earlier: Losses) -> Losses:
         """Return the losses since an earlier reading."""
@@ -179,6 +179,7 @@ class BurstBus(can.BusABC):
 
     def take(self) -> can.Message | None:
         """Return a frame that is received already; None where the bus must be read for the next."""
+        # Filters are applied by `receive_within` alone.
         if self._received and self._filters is None:
             return self._received.popleft()
         return None
@@ -190,6 +191,7 @@ class BurstBus(can.BusABC):
         return receive_within(self, timeout)
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        # The caller applies its filters where this is False.
         already_filtered = False
         if not self._received:
             self._fill(timeout)
@@ -305,7 +307,7 @@ class SocketcanBus(BurstBus):
         """
         filters = bytearray()
         for identifier, mask in wanted:
-            # Flags in the mask that are not in the identifier: only a base data frame matches.
+            # The mask has both flags and the identifier none: a frame with one does not match.
             filters += _FILTER.pack(identifier, mask | _EXTENDED | _REMOTE)
         # A socket other than CAN_RAW has no filters: it receives all.
         with suppress(OSError):
@@ -322,7 +324,7 @@ class SocketcanBus(BurstBus):
                 return
         except (OSError, ValueError) as error:
             raise can.CanOperationError(str(error)) from error
-        # What was received last is empty at the end of the file.
+        # A socket gives no bytes at the end of the file.
         end_of_file = not self._unparsed[-1]
         if end_of_file:
             exit_code = self._wait()
@@ -363,7 +365,7 @@ class SocketcanBus(BurstBus):
         """
         unparsed = b"".join(self._unparsed)
         complete_bytes = len(unparsed) - len(unparsed) % RECORD.size
-        rest = deque((unparsed[complete_bytes:],))
+        incomplete_record = deque((unparsed[complete_bytes:],))
         received = self._received.copy()
         ready = self._ready
         end_reason = self._end_reason
@@ -383,7 +385,7 @@ class SocketcanBus(BurstBus):
         losses = Losses(*lost)
         until_ns = max(monotonic_ns, self.read_until_ns)
         # Assignments alone, without a call: an exception changes all of the state, or none of it.
-        self._unparsed = rest
+        self._unparsed = incomplete_record
         self._received = received
         self._ready = ready
         self._end_reason = end_reason

@@ -2,13 +2,16 @@
 
 A frame that carries a node id goes to the bus of that node: SDO, PDO and EMCY by the lower seven
 bits of their COB-ID (CiA 301, predefined connection set), NMT by its second byte. Frames without a
-node go to all buses: SYNC, NMT to all, and the heartbeat of the recorder. Received frames come in
-the order of their time stamps, which all interfaces take from clocks of this computer: monotonic
-where all have such stamps, else wall time. Where all have such stamps, our own SYNC comes when it
-has been received from every bus: all frames that arrived on their bus before it have come by then.
+node go to all buses: SYNC, NMT to all, and the heartbeat of the recorder.
 
-A bus that fails is reported once, as a BusError with its name. The others go on, so that their axes
-can be stopped and restored; the nodes of the failed bus are silent from then on.
+Received frames that wait on several buses come in the order of their time stamps, which all
+interfaces take from clocks of this computer: monotonic where all have such stamps, else wall time.
+Where all have monotonic stamps, our own SYNC is returned once every bus has given it back. So every
+frame that came before the SYNC on its bus is returned before the SYNC.
+
+A bus that fails is reported once, as a BusError with its name; buses that fail while one burst is
+sent, as one BusError with all their names. The others go on, so that their axes can be stopped and
+restored; the nodes of the failed bus are silent from then on.
 """
 
 from __future__ import annotations
@@ -34,9 +37,11 @@ from drivers.errors import BusError, NodeMisplaced, node_label
 
 #: Time to wait at one bus while another may receive, where one of them has no file descriptor
 ALTERNATION_S = 0.0005
-#: Time after a time-out in which frames that are left out may still be read: a flood of them
+#: Time after a time-out in which frames are still read that are left out, such as those of a node
+#: on a wrong bus; a flood of them must not keep the reader
 LONGEST_LEFT_OUT_S = 0.1
-#: Frames of one bus in a row while another has one too: a lagging clock must not silence the others
+#: Most frames of one bus in a row while another has one too. Where the clock of a bus lags, all its
+#: frames are older than those of the others, which would not be read.
 LARGEST_RUN = 64
 BUS_OFF = 0x40  # linux/can/error.h, class CAN_ERR_BUSOFF of an error frame
 BUS_OFF_REASON = "bus-off: the CAN controller disconnected itself; check the wiring"
@@ -97,10 +102,10 @@ def open_cell_bus(address: CellAddress, *, answering: bool = False) -> can.BusAB
     """
     if isinstance(address, BusAddress):
         return open_bus(address, answering=answering)
-    homes: dict[int, BusPart] = {}  # bus of each node, by its id
+    part_of_node: dict[int, BusPart] = {}  # by node id
     for part in address.parts:
         for node_id in part.node_ids:
-            other = homes.setdefault(node_id, part)
+            other = part_of_node.setdefault(node_id, part)
             if other is not part:
                 label = node_label(node_id, part.axis_names)
                 shared = f"{label} is on {other.name} and on {part.name}"
@@ -145,8 +150,10 @@ class SplitBus(can.BusABC):
         self._misplaced: set[tuple[int, int]] = set()  # node and bus, those raised already
         self._last_bus = 0  # of the last frame
         self._frames_in_a_row = 0  # of that bus
-        self._waits = 0  # at one bus, where one of them has no file descriptor
-        self._handles = tuple(_fileno(end) for end in self._ends)
+        # Number of waits at a single bus, where one of them has no file descriptor: the buses take
+        # turns
+        self._waits = 0
+        self._handles = tuple(_fileno(end) for end in self._ends)  # file descriptors
         # Whether all have monotonic stamps
         self._stamped = all(read_until_ns(end) is not None for end in self._ends)
         super().__init__(channel=str(address))
@@ -206,8 +213,8 @@ class SplitBus(can.BusABC):
         """Send several frames in their order; consecutive frames of one bus go there in one call.
 
         A frame for all buses goes to one right after the other, when everything before it has been
-        sent: this keeps the SYNCs close together. A bus that fails raises BusError after the others
-        got their frames.
+        sent: this keeps the SYNCs close together. Buses that fail raise one BusError with all their
+        names, after the others got their frames.
         """
         failures: list[BusError] = []
         for route, group in groupby(messages, self.address.route):
@@ -218,7 +225,7 @@ class SplitBus(can.BusABC):
                 for frame in frames:
                     failures += self._send_to(route, (frame,))
         if failures:
-            raise failures[0]
+            raise _joined(failures)
         self._require_one()
 
     def _send_to(self, route: Sequence[int], frames: Sequence[can.Message]) -> list[BusError]:
@@ -253,7 +260,8 @@ class SplitBus(can.BusABC):
                     return message
                 if end_s is not None and self._clock() > end_s + LONGEST_LEFT_OUT_S:
                     return None
-                continue  # an end may hold more frames without a ready file descriptor
+                # The end may hold another frame, which its file descriptor does not show.
+                continue
             left_s = None if end_s is None else end_s - self._clock()
             if left_s is not None and left_s <= 0:
                 return None
@@ -295,6 +303,7 @@ class SplitBus(can.BusABC):
             received = [(message, index) for message, index in waiting if message.is_rx]
             working = len(self._ends) - len(self._failed)
             if waiting and not received and len(waiting) == working:
+                # Every bus has given our SYNC back.
                 _, first = waiting[0]
                 for _, index in waiting[1:]:
                     self._waiting[index] = None
@@ -345,7 +354,7 @@ class SplitBus(can.BusABC):
         if len(handles) == len(buses):
             select.select(handles, (), (), left_s)
             return
-        # One bus in turn, each for a moment; a single one for the time that is left.
+        # The buses in turn, each for a moment; a single one for the time that is left.
         self._waits += 1
         index = buses[self._waits % len(buses)]
         if left_s is None:
@@ -359,7 +368,7 @@ class SplitBus(can.BusABC):
     def _fail(self, index: int, error: Exception) -> BusError:
         """Leave a bus out from now on, and return its failure with its name.
 
-        Its own SYNC is dropped: those of the other buses do not wait for it.
+        Our SYNC that it gave back is dropped: those of the other buses do not wait for it.
         """
         self._failed.add(index)
         waiting = self._waiting[index]
@@ -390,7 +399,18 @@ class SplitBus(can.BusABC):
             except _FAILURES as error:
                 failures.append(self._fail(index, error))
         if failures:
-            raise failures[0]
+            raise _joined(failures)
+
+
+def _joined(failures: Sequence[BusError]) -> BusError:
+    """Return one error with the names and reasons of all buses that failed."""
+    first, *others = failures
+    if not others:
+        return first
+    reason = "; ".join([first.reason, *map(str, others)])
+    joined = BusError(first.address, reason)
+    joined.__cause__ = first.__cause__
+    return joined
 
 
 def _arrival_times(waiting: Sequence[tuple[can.Message, int]]) -> list[tuple[float, int]]:

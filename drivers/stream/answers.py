@@ -32,7 +32,7 @@ class StreamStatistics:
     late: int = 0  #: answers that came in the next cycle, and doubtful ones
     duplicate: int = 0  #: second answers of an axis to one SYNC
     surplus: int = 0  #: PDOs of an axis of the cell that are not mapped
-    #: answers whose length differs from the mapping; they count as missing too
+    #: answers whose length differs from the mapping; within their cycle they count as missing too
     wrong_length: int = 0
     #: periods without a SYNC because the schedule slipped, or a followed SYNC did not come
     skipped_periods: int = 0

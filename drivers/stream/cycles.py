@@ -77,11 +77,11 @@ class CycleBus:
         self.skipped = 0
         #: Time of the last SYNC in the samples [ns since 1970]; the start before the first one
         self.time_ns = start_ns
-        #: Time of the last answer by the clock [ns]; of the first SYNC before the first answer
+        #: Time of the last answer by the clock [ns]; before the first one, that of the first SYNC
         self.answered_ns = 0
         #: Whether no axis answered the last SYNC
         self.silent = False
-        #: Frames to send right before the next SYNC, which triggers synchronous RPDOs.
+        #: Frames that are sent before the next SYNC, which triggers synchronous RPDOs.
         self.outgoing: list[can.Message] = []
         #: Returns frames that are sent only where `outgoing` is empty; takes the last SYNC's time
         #: [ns since 1970].
@@ -108,7 +108,10 @@ class CycleBus:
         self.time_ns = self._start_ns + at_ns - self._first_sync_ns
 
     def arrived_frames(self) -> Iterator[can.Message]:
-        """Yield the frames that have arrived already; a reader that needs too long is a fault."""
+        """Yield the frames that have arrived already.
+
+        To read them for longer than `LARGEST_LAG_NS` is a fault.
+        """
         recv = self.link.bus.recv
         begun_ns = self.clock()
         while (message := recv(0.0)) is not None:
@@ -136,7 +139,7 @@ class CycleBus:
     def check_lag(self, behind_ns: int) -> bool:
         """Return whether the reader is more than `LARGEST_LAG_NS` behind the bus.
 
-        The first time adds a fault; whether frames were lost as well is in the counts.
+        The first time adds a fault. It does not say that frames were lost: those are counted.
         """
         is_late = behind_ns > LARGEST_LAG_NS
         if is_late and not self._reported_late:
@@ -164,7 +167,7 @@ class Cycles(ABC):
 
     def __init__(self, bus: CycleBus) -> None:
         self.bus = bus
-        #: SYNC of the next cycle, where its arrival ended the last one; it was read already
+        #: SYNC of the next cycle, where it has been read: its arrival ended the last cycle
         self.early_sync: can.Message | None = None
 
     def begin(self) -> Cycles:

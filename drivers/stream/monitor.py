@@ -2,7 +2,8 @@
 
 While another master is on the bus, nothing is sent: its SYNC and the answers in our mapping are
 overheard, each cycle a `Sample`. On a quiet bus the axes are read by SDO uploads, one open request
-a node; then a sample has the last values of all axes, every READING_S. Nothing is ever written.
+a node; then a sample has the last values of all axes, every READING_S, and an axis that refuses an
+object is marked missing. Nothing is ever written.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ class ReadingSource(Enum):
     """Origin of the readings."""
 
     OVERHEARD = "overheard"  #: answers to the SYNC of another master
-    ASKED = "asked"  #: SDO uploads of our own
+    ASKED = "asked"  #: SDO uploads of our own, where no other master is on the bus
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,9 +53,9 @@ class ObjectRefusal:
 class AxisReading:
     """Reading of one axis."""
 
-    position_counts: int | None  #: last value, None before the first
-    current_raw: int | None  #: last value, None before the first
-    statusword: int | None  #: last value, None before the first
+    position_counts: int | None  #: last value, None before the first and after a refusal
+    current_raw: int | None  #: likewise
+    statusword: int | None  #: likewise
     nmt: int | None  #: state in its last heartbeat, None before the first
     rate_hz: float  #: of complete sets of these values since the last reading
     lost: int  #: SYNCs or requests without an answer since the monitor began
@@ -98,9 +99,12 @@ class _AxisWatch:
         self.node_id = axis.node_id
         self.entries = feedback_entries(axis)
         self.slots = slots_of((axis,))  # by COB-ID
+        # None before the first answer, and where the last one had no value
         self.values: list[int | None] = [None] * len(self.entries)
+        self.last_values = [0] * len(self.entries)  # also after a refusal; 0 before the first
         self.answered: set[int] = set()  # COB-IDs of the answers to the last SYNC
         self.has_answered = False  # whether an earlier SYNC was answered completely
+        self.in_set: set[int] = set()  # COB-IDs of the overheard set that is not complete
         self.sets = 0  # complete ones since the last `take`
         self.lost = 0  # SYNCs or requests without an answer
         self.complete_ns: int | None = None  # when the last complete set by SDO came
@@ -126,7 +130,7 @@ class _AxisWatch:
         """
         position, current, statusword = self.values
         lasted_s = max((now_ns - since_ns) * 1e-9, 1e-9)
-        # An axis that sent nothing since then is silent.
+        # An axis is silent that sent nothing since the last reading, and for at least ABANDONED_S.
         silent_since_ns = min(since_ns, now_ns - round(ABANDONED_S * 1e9))
         refused = [self.refused[column] for column in sorted(self.refused)]
         delay_s = None
@@ -154,11 +158,12 @@ class _AxisWatch:
             # Another master's mapping: not ours to interpret.
             return
         for column, value in zip(slot.columns, slot.layout.unpack(data), strict=True):
-            self.values[column] = value
-            self.refused.pop(column, None)
+            self._note_value(column, value)
         self.answered.add(cob_id)
-        if self.is_complete:
+        self.in_set.add(cob_id)
+        if self.in_set == self.slots.keys():
             self.sets += 1
+            self.in_set.clear()
 
     def hear_sync(self) -> None:
         """End the time for answers to the SYNC before.
@@ -170,6 +175,7 @@ class _AxisWatch:
         elif self.has_answered:
             self.lost += 1
         self.answered.clear()
+        self.in_set.clear()
 
     def hear_answer(self, data: bytes, now_ns: int) -> None:
         """Take an SDO answer to the open request, however late it comes."""
@@ -185,15 +191,22 @@ class _AxisWatch:
         delay_ns = now_ns - self.request_ns
         self.longest_delay_ns = max(self.longest_delay_ns or 0, delay_ns)
         self.request_ns = None
-        self.values[column] = answer.value
         if answer.value is None:
+            self.values[column] = None
             self.refused[column] = ObjectRefusal(entry, answer.abort_code)
         else:
-            self.refused.pop(column, None)
+            self._note_value(column, answer.value)
+        # An axis that refuses an object has no complete set.
         is_last = column == len(self.entries) - 1
         if is_last and not self.refused:
             self.sets += 1
             self.complete_ns = now_ns
+
+    def _note_value(self, column: int, value: int) -> None:
+        """Note the value of an object, which is refused no more."""
+        self.values[column] = value
+        self.last_values[column] = value
+        self.refused.pop(column, None)
 
     def next_request(self, now_ns: int) -> ObjectEntry | None:
         """Return the object to request now; None while an answer is awaited, or no set is due."""
@@ -369,6 +382,8 @@ class CellMonitor:
     def _note_master(self) -> None:
         """Note that another master uses the bus, or is about to."""
         if self.source is ReadingSource.ASKED:
+            # The axes answer to its SYNC from now on; missing answers count as lost once the first
+            # has come.
             self.pause()
             for axis in self._axes:
                 axis.has_answered = False
@@ -392,15 +407,18 @@ class CellMonitor:
 
     def _sample_asked(self, now_ns: int) -> None:
         """Make a sample of the last values, if it is due."""
+        # The last SYNC of a master that is gone gets no sample.
         self._last_sync = None
         if now_ns < self._next_sample_ns:
             return
         self._next_sample_ns = now_ns + round(READING_S * 1e9)
+        # A set begins every READING_S, and its answers may take ANSWER_S; the rest is a margin.
         oldest_ns = now_ns - round((2 * READING_S + ANSWER_S) * 1e9)
         missing = []
         for axis in self._axes:
-            is_missing = axis.complete_ns is None or axis.complete_ns < oldest_ns
-            missing.append(is_missing)
+            is_old = axis.complete_ns is None or axis.complete_ns < oldest_ns
+            refuses = bool(axis.refused)
+            missing.append(is_old or refuses)
         self._emit(now_ns, missing)
 
     def _emit(self, time_ns: int, missing: list[bool]) -> None:
@@ -408,7 +426,7 @@ class CellMonitor:
         by_axis = []
         missing_bits = 0
         for number, axis in enumerate(self._axes):
-            by_axis.append([value or 0 for value in axis.values])
+            by_axis.append(axis.last_values)
             if missing[number]:
                 missing_bits |= 1 << number
         position, current, statusword = zip(*by_axis, strict=True)

@@ -34,7 +34,8 @@ CYCLE_PERIOD = ObjectEntry(0x1006, 0, 32)
 PRODUCES = 1 << 30  #: Bit of 1005h
 #: Time for which the kernel goes on alone; less than the 0.5 s of the amplifiers' own watch
 LEASE_S = 0.4
-LEAST_SYNCS = 3  #: In this time, also at a long period
+#: SYNCs that the kernel sends alone where the period is so long that fewer come in `LEASE_S`
+LEAST_SYNCS = 3
 RENEWAL_S = 0.025  #: Time between two renewals
 STEERING_S = 0.25  #: Time between two corrections of the kernel's interval
 #: Fraction of the period; a kernel that is later than that produces time stamps which are refused
@@ -51,8 +52,8 @@ _HEAD = struct.Struct("@3I4l2I0q")
 def steered_us(period_us: int, interval_us: int, late_ns: int, phase_ns: int, periods: int) -> int:
     """Return the kernel's interval for the next window of SYNCs [us].
 
-    The lateness of the last window is expected again, and the lateness in the schedule is corrected
-    within one window.
+    The next window is expected to be too long by `late_ns` again, and it has to be shorter by
+    `phase_ns` to end on schedule. Its periods share both.
 
     Args:
         period_us: of the schedule [us].
@@ -81,10 +82,12 @@ def setup_message(flags: int, interval_us: int) -> bytes:
 class KernelProducer(Producer, AbstractContextManager["KernelProducer"]):
     """SYNC by the kernel's broadcast manager (CAN_BCM), whose timer needs no process to wake up.
 
-    It ends with the process that started it, and `LEASE_S` after that process has seen its last
-    SYNC: a recorder that hangs must not keep the axes running, one that is stopped for 300 ms must
-    lose nothing. Each interval counts from the actual time of the last SYNC, so the period is too
-    long by the lateness of the timer: `seen` measures that and shortens the interval.
+    It ends at once with the process that started it. Where that process lives and sees no SYNC, it
+    ends after `LEASE_S`: a recorder that hangs must not keep the axes running, one that is stopped
+    for 300 ms must lose nothing.
+
+    Each interval counts from the actual time of the last SYNC, so the period is too long by the
+    lateness of the timer: `seen` measures that and shortens the interval.
     """
 
     in_kernel = True
@@ -96,8 +99,8 @@ class KernelProducer(Producer, AbstractContextManager["KernelProducer"]):
         self._interval_us = period_us
         self._window_periods = max(8, round(STEERING_S * 1e6 / period_us))
         self._window_begun_ns = 0  # by the SYNC that began it
-        self._periods = 0  # since then
-        self._phase_ns = 0  # time by which that SYNC was late in the schedule
+        self._periods = 0  # since the window began
+        self._phase_ns = 0  # time by which the SYNC that began it was late in the schedule
         self._renewed_ns = 0
 
     def __exit__(self, *_: object) -> None:
@@ -133,7 +136,7 @@ class KernelProducer(Producer, AbstractContextManager["KernelProducer"]):
         since_renewal_ns = monotonic_ns - self._renewed_ns
         is_renewed = 0 <= since_renewal_ns < RENEWAL_S * 1e9
         if self._socket is not None and not is_renewed:
-            # A timer that has ended is not started again: the recorder was stopped for too long.
+            # This does not start a timer that has ended: the recorder was stopped for too long.
             self._renewed_ns = monotonic_ns
             self._socket.send(setup_message(_SET_TIMER, self._interval_us))
         if periods == 0:
@@ -193,17 +196,15 @@ class DriveProducer(Producer, AbstractContextManager["DriveProducer"]):
         super().__init__(network.axes[axis].name, period_us)
         self._network = network
         self._node_id = network.node_ids[axis]
-        self._before: _SyncObjects | None = None  # None unless started
+        self._before: _SyncObjects | None = None  # as before the first start; None unless started
         self._produces = False
 
     def __exit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
-        try:
-            if error is not None:
-                self._network.begin_closing()
+        if error is None:
             self.stop()
-        except DriverError as problem:
-            if error is None:
-                raise
+            return
+        self._network.begin_closing()
+        for problem in self._restore():
             error.add_note(f"{WHILE}stopping SYNC: {problem}")
 
     def start(self) -> None:
@@ -235,20 +236,47 @@ class DriveProducer(Producer, AbstractContextManager["DriveProducer"]):
             self._produces = False
 
     def stop(self) -> None:
-        """Restore both objects, if started and if the drive still answers."""
+        """Restore both objects, if started and if the drive still answers.
+
+        Raises:
+            DriverError: an object could not be restored. A note names the other one, where that
+                could not be restored either.
+        """
+        problems = self._restore()
+        if problems:
+            first, *others = problems
+            for other in others:
+                first.add_note(f"{WHILE}stopping SYNC: {other}")
+            raise first
+
+    def _restore(self) -> list[DriverError]:
+        """Restore both objects, as `stop`; return a problem for each that could not be restored."""
         before = self._before
         self._before = None
         self._produces = False
         try:
-            if before is not None and self._node_id not in self._network.link.silent:
-                access = self._network.link.objects(self._node_id)
-                # Production ends first, and another identifier comes back in a write of its own.
-                access.write(SYNC_COB_ID_OBJECT, SYNC_COB_ID)
-                access.write(CYCLE_PERIOD, before.period_us)
-                if before.cob_id != SYNC_COB_ID:
-                    access.write(SYNC_COB_ID_OBJECT, before.cob_id)
+            if before is None or self._node_id in self._network.link.silent:
+                return []
+            return self._write_back(before)
         finally:
             self._network.link.sync_producer = None
+
+    def _write_back(self, before: _SyncObjects) -> list[DriverError]:
+        """Write both objects, also where one is refused; return a problem for each that was."""
+        # Production ends first, and another identifier comes back in a write of its own.
+        writes = [(SYNC_COB_ID_OBJECT, SYNC_COB_ID), (CYCLE_PERIOD, before.period_us)]
+        if before.cob_id != SYNC_COB_ID:
+            writes.append((SYNC_COB_ID_OBJECT, before.cob_id))
+        access = self._network.link.objects(self._node_id)
+        problems: dict[ObjectEntry, DriverError] = {}  # of the last write of each object
+        for entry, value in writes:
+            try:
+                access.write(entry, value)
+            except DriverError as problem:
+                problems[entry] = problem
+            else:
+                problems.pop(entry, None)
+        return list(problems.values())
 
 
 SyncProducer = KernelProducer | DriveProducer

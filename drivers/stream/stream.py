@@ -37,8 +37,7 @@ class SyncStream:
             is returned.
 
     Raises:
-        SampleLost: by ``next``, as all of these: more incomplete cycles in a row than
-            `MAX_MISSING_CYCLES`.
+        SampleLost: more incomplete cycles in a row than `MAX_MISSING_CYCLES`.
         DriveFault: an EMCY, a new fault or following error, a node that left OPERATIONAL or sends
             no heartbeat for two of its periods, an active limit, stale data, or a PDO of wrong
             length twice in a row.
@@ -59,8 +58,8 @@ class SyncStream:
         self._link = network.link
         self._answers = Answers(network.axes, network.pdos, certain=pacing.waits_for_answers)
         self._counts = self._answers.counts
-        #: The bus as the cycles use it. The mover adds frames to send with the next SYNC, and reads
-        #: whether an axis answered the last one.
+        #: The bus as the cycles use it. `drivers.motion.execute` adds frames to send with the next
+        #: SYNC, and reads whether an axis answered the last one.
         self.bus = CycleBus(
             network.link,
             pacing.clock,
@@ -74,8 +73,9 @@ class SyncStream:
         self._last_wrong_length: dict[int, int] = {}
         # Whether `read_on` was called since the last cycle
         self._has_read_on = False
+        # Counted by the bus since it was opened: up to the first SYNC, and up to the last report
         self._losses_at_begin = Losses()
-        self._losses = Losses()  # those reported so far, and those at the begin
+        self._losses = Losses()
         self._incomplete_cycles = 0  # the last ones in a row
         self._silent_cycles = 0  # the last ones in a row
 
@@ -125,7 +125,7 @@ class SyncStream:
                 self._collect()
         except (BusError, NodeMisplaced) as error:
             if self.bus.cycles > 0:
-                # No later cycle may report what was lost before the failure.
+                # There may be no later cycle that would report them.
                 self._note_losses()
             self.bus.report(None, EventKind.BUS_LOST, 0, str(error))
             raise
@@ -273,7 +273,9 @@ class SyncStream:
         """Count an answer after the last cycle; `in_cycle` after another SYNC."""
         if not in_cycle:
             self._process_between_cycles(message)
-        elif len(message.data) == slot.length:
+        elif len(message.data) != slot.length:
+            self._note_length(slot, message.arbitration_id, len(message.data))
+        else:
             self._answers.take(message.arbitration_id, slot, message.data)
 
     def _process_between_cycles(self, message: can.Message) -> None:
@@ -282,7 +284,10 @@ class SyncStream:
         if slot is None:
             self._process_other(message)
         elif self.bus.cycles == 0:
+            # From before the first SYNC: it does no harm.
             self._counts["foreign"] += 1
+        elif len(message.data) != slot.length:
+            self._note_length(slot, message.arbitration_id, len(message.data))
         else:
             self._answers.take_between(slot)
 

@@ -34,8 +34,8 @@ from drivers.stream.cycles import CycleBus
 FROZEN_S = 0.05
 #: Least distance of the set-point in this time. One that creeps or has just begun proves nothing.
 FROZEN_COUNTS = 64
-#: Time without a toggle that is reported [update periods of the amplifier, and periods of SYNC].
-#: Less may be the difference of two timers.
+#: Time without a toggle that is reported: so many update periods of the amplifier, and at least so
+#: many cycles. Less may be the difference of two timers.
 STALE_PERIODS = 2
 HEARTBEAT_PERIODS = 2.0  #: Silence after which a node is lost
 #: Duration of an active limit that is reported. A current that saturates in a ramp is masked by the
@@ -48,8 +48,7 @@ class FrozenData:
     """Detection of moving axes whose data do not change.
 
     Args:
-        move: the move that the axes make; the first sample is the one at which it begins, or a
-            later one.
+        move: the move that the axes make. It counts as begun with the first sample.
         start_counts: position of every axis before the move.
         axes: indices of the axes that move.
         period_ns: period of the samples.
@@ -73,7 +72,10 @@ class FrozenData:
         self._unchanged_since_s: dict[int, float] = {}
 
     def frozen(self, sample: Sample) -> tuple[int, ...]:
-        """Return the axes whose values have not changed for too long; takes every sample once."""
+        """Return the axes whose values have not changed for too long.
+
+        It must be called once for every sample.
+        """
         if self._first_cycle is None:
             self._first_cycle = sample.cycle
         now_s = (sample.cycle - self._first_cycle) * self._period_s
@@ -215,6 +217,7 @@ class Watch:
             self._bus.faults.append(fault)
         clock_ns = self._bus.clock()
         if clock_ns >= self._next_heartbeat_check_ns and self._allowed_silence_ns > 0:
+            # Not in every cycle: eight times in that silence are enough.
             self._next_heartbeat_check_ns = clock_ns + self._allowed_silence_ns // 8
             self._check_heartbeats(time_ns, clock_ns)
         self._has_begun = True
@@ -230,6 +233,7 @@ class Watch:
             active_ns = time_ns - since_ns
             if active_ns <= LIMIT_S * 1e9:
                 continue
+            # Reported once, until the limit becomes active again
             del self._limited_since_ns[axis]
             node = self._network.axes[axis]
             active_s = active_ns * 1e-9
@@ -313,6 +317,7 @@ class Watch:
             self._bus.emit(event)
             if event.kind is EventKind.BUS_BUSY:
                 self._note_other_sender(event.code)
+            # Until the first cycle is processed, an event may be from before this recording.
             if event.axis is not None and self._has_begun:
                 node = self._network.axes[event.axis]
                 self._note_fault_of_node(node, event)

@@ -65,6 +65,18 @@ def test_a_drive_without_rated_torque_says_that_nothing_was_checked(torque: int 
     assert found.warnings == (expected,)
 
 
+def test_a_negative_rated_torque_is_named_and_nothing_is_checked_with_it() -> None:
+    signed_torque = replace(RATED_TORQUE, signed=True)
+    rated = RatedMotor(RATED_CURRENT, torque=signed_torque)
+    with drive() as (access, node):
+        node.objects[0x6076, 0] = (2**32 - 1500, 4)
+        found = read_scale(access, replace(PROFILE, rated=rated))
+    assert found.rated_torque_nm is None
+    (warning,) = found.warnings
+    assert warning.startswith("drive reports a rated torque below zero (6076h:00 = -1500); ")
+    assert check_nameplate(found, Amplitude.RMS, 0.7) == ()
+
+
 @pytest.mark.parametrize("lacking", [0x6075, 0x6076])
 def test_a_torque_without_a_unit_is_said_not_to_be_logged(lacking: int) -> None:
     fixed = replace(PROFILE.current_scale, factor=0.002, objects=())  # it needs no rated current

@@ -9,7 +9,7 @@ from drivers.canopen.sdo import SdoPolicy, UploadAnswer, upload_answer, upload_r
 from drivers.errors import ObjectAccessError
 from drivers.profiles.profile import ObjectEntry
 from tests.drivers.hostile import NAME, Hostile, about
-from tests.drivers.scripted import ADDRESS, FakeClock, ScriptedBus
+from tests.drivers.scripted import ADDRESS, FakeClock, ScriptedBus, ScriptedNode
 
 TORQUE = ObjectEntry(0x6077, 0, 16, signed=True)
 
@@ -79,3 +79,19 @@ def test_a_text_of_ten_segments_has_two_seconds(segment_s: float, is_read: bool)
     with pytest.raises(ObjectAccessError, match=r"found 70 bytes and no end, .* within 2 s"):
         access.read_bytes(NAME, 0)
     assert left == 3
+
+
+def test_answers_that_nobody_waits_for_are_not_stored() -> None:
+    """A stream reads slow objects for as long as a run lasts, and their answers by itself."""
+    clock = FakeClock()
+    bus = ScriptedBus((ScriptedNode(1),), clock)
+    link = Link(ADDRESS, SdoPolicy(), clock, lambda _: bus)
+    link.open()
+    access = link.objects(1)
+    rated_current = ObjectEntry(0x6075, 0, 32)
+    access.read(rated_current)
+    for _ in range(100):
+        link.send((upload_request(1, TORQUE),))
+        link.pump(0.0)
+    assert access._client.responses.qsize() == 0
+    assert access.read(rated_current) == 2000

@@ -361,6 +361,26 @@ def test_a_bus_that_fails_is_named_once_and_the_other_goes_on(
             pair.bus.recv(0.1)
 
 
+def test_buses_that_fail_in_one_burst_are_all_named_and_the_third_goes_on() -> None:
+    clock = FakeClock()
+    log: list[tuple[str, int]] = []
+    wires = [Wire(name, log, clock) for name in ("left", "middle", "right")]
+    parts = []
+    for number, wire in enumerate(wires, start=1):
+        address = BusAddress("scripted", wire.name)
+        parts.append(BusPart(wire.name, address, frozenset((number,))))
+    bus = SplitBus(SplitAddress(tuple(parts)), wires, lambda: clock.now_ns * 1e-9)
+    left, _, right = wires
+    left.broken = True
+    right.broken = True
+    with pytest.raises(BusError, match=r"bus left .*; bus right .*: the wire was cut"):
+        bus.send(frame(SYNC))
+    bus.send(frame(SYNC))
+    assert bus.recv(0.0) is None
+    assert log == [("middle", SYNC)] * 2
+    bus.shutdown()
+
+
 def test_a_controller_that_went_off_its_bus_is_named(pair: Pair) -> None:
     bus_off = frame(BUS_OFF, is_error_frame=True, data=bytes(8))
     pair.right.coming.append(bus_off)

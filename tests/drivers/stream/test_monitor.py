@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 import can
 import pytest
@@ -25,7 +26,7 @@ from drivers.stream.monitor import (
     ReadingSource,
 )
 from tests.drivers.quiet_bus import QuietBus, frame, overheard_cycle
-from tests.drivers.scripted import FakeClock
+from tests.drivers.scripted import PROFILE, FakeClock
 
 NUMBERS = range(1, 7)
 AXES = tuple(Axis(f"J{number}", number) for number in NUMBERS)
@@ -259,6 +260,19 @@ def test_a_frame_of_another_mapping_is_no_value(bus: QuietBus) -> None:
     assert axis.rate_hz == 0.0
 
 
+def test_a_set_of_two_frames_counts_when_both_came_also_without_sync(bus: QuietBus) -> None:
+    wide = replace(PROFILE, current=ObjectEntry(0x2077, 0, 32, signed=True))
+    axis = Axis("J1", 1, wide)
+    monitor = CellMonitor(link(bus), (axis,))
+    for cycle in range(20):
+        after_ns = (cycle + 1) * 10_000_000
+        receive(bus, 0x181, bytes(8), after_ns)
+        receive(bus, 0x281, bytes(2), after_ns + 1000)
+    reading = monitor.watch(0.5)
+    assert first_axis(reading).position_counts == 0
+    assert first_axis(reading).rate_hz == pytest.approx(20 / 0.5)
+
+
 def test_queried_values_are_samples_with_wall_time_ten_times_a_second(
     bus: QuietBus, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -360,6 +374,37 @@ def test_an_aborted_object_is_named_until_it_is_given(
     axis = first_axis(reading)
     assert axis.refused == ()
     assert axis.statusword == 0x250
+
+
+@pytest.mark.parametrize("refused_index", [POSITION_INDEX, STATUSWORD_INDEX])
+def test_an_axis_that_refuses_an_object_is_missing_with_its_last_values(
+    bus: QuietBus, monkeypatch: pytest.MonkeyPatch, refused_index: bytes
+) -> None:
+    samples: list[Sample] = []
+    monitor = monitor_of(bus, samples)
+    aborting: list[int] = []
+
+    def reply(node: int, data: bytes) -> bytes:
+        if data[1:3] == refused_index and node in aborting:
+            return b"\x80" + data[1:4] + bytes.fromhex("22000008")
+        return value_reply(data, 0x237)
+
+    monitor.watch(QUIET_S)
+    answer_all(bus, monkeypatch, reply)
+    monitor.watch(1.0)
+    assert samples[-1].missing == 0
+    samples.clear()
+    aborting.append(2)
+    reading = monitor.watch(4 * READING_S)
+    assert reading.axes[1].refused
+    # The first sample may be of the values before the refusal.
+    assert {sample.missing for sample in samples[1:]} == {0b10}
+    for sample in samples:
+        assert sample.position_counts == (0x237,) * 6
+        assert sample.statusword == (0x237,) * 6
+    aborting.clear()
+    monitor.watch(3 * READING_S)
+    assert samples[-1].missing == 0
 
 
 def test_heartbeats_and_emergencies_of_axes_are_reported(bus: QuietBus) -> None:

@@ -138,6 +138,50 @@ def test_a_drive_that_cannot_produce_says_so_and_is_given_back() -> None:
     assert "while stopping SYNC" in " ".join(refusal.value.__notes__)
 
 
+def test_a_drive_that_refuses_one_object_gets_the_other_back() -> None:
+    network, bus = cell()
+    node = with_sync_objects(bus.nodes[0], 0x85, 7)
+    node.aborts[0x1006, 0] = 0x06010002
+    refused = pytest.raises(ObjectAccessError, match="1006h")
+    with network, refused as refusal, DriveProducer(network, 0, PERIOD_US) as producer:
+        producer.start()
+    assert node.value(0x1005, 0) == 0x85
+    (note,) = refusal.value.__notes__
+    assert "1006h" in note
+
+
+def test_each_object_that_a_drive_does_not_get_back_is_named() -> None:
+    network, bus = cell()
+    node = with_sync_objects(bus.nodes[0], 0x85, 7)
+    refused = pytest.raises(ObjectAccessError, match="1005h")
+    with network:
+        with refused as refusal, DriveProducer(network, 0, PERIOD_US) as producer:
+            producer.start()
+            node.aborts[0x1005, 0] = 0x08000022
+            node.aborts[0x1006, 0] = 0x08000022
+        assert network.link.sync_producer is None
+        (note,) = refusal.value.__notes__
+        assert "while stopping SYNC" in note
+        assert "1006h" in note
+
+
+def test_what_a_drive_does_not_get_back_is_noted_at_the_error_that_ended_the_run() -> None:
+    network, bus = cell()
+    node = with_sync_objects(bus.nodes[0], 0x85, 7)
+    error = RuntimeError("a full disk")
+    failed = pytest.raises(RuntimeError, match="a full disk")
+    with network, failed, DriveProducer(network, 0, PERIOD_US) as producer:
+        producer.start()
+        node.aborts[0x1005, 0] = 0x08000022
+        node.aborts[0x1006, 0] = 0x08000022
+        raise error
+    of_identifier, of_period = error.__notes__
+    assert "while stopping SYNC" in of_identifier
+    assert "1005h" in of_identifier
+    assert "while stopping SYNC" in of_period
+    assert "1006h" in of_period
+
+
 def test_a_drive_that_has_fallen_silent_is_not_asked() -> None:
     network, bus = cell()
     with_sync_objects(bus.nodes[0])

@@ -218,6 +218,36 @@ def test_a_cut_frame_is_counted_and_missing(lockstep: Prepared, length: int) -> 
     assert stream.statistics == expected
 
 
+def cut_second(bus: ScriptedBus, cob_id: int, cycle: int) -> None:
+    """Let a frame of seven bytes follow one of these frames."""
+
+    def tamper(message: can.Message) -> tuple[can.Message, ...]:
+        if message.arbitration_id == cob_id and bus.cycle == cycle:
+            return (message, frame(cob_id, bytes(7)))
+        return (message,)
+
+    bus.tamper = tamper
+
+
+def test_a_cut_frame_between_two_cycles_is_of_wrong_length(lockstep: Prepared) -> None:
+    stream, bus, events = lockstep
+    cut_second(bus, 0x182, cycle=1)
+    assert missing_of_next(stream, 3) == [0, 0, 0]
+    expected = StreamStatistics(cycles=3, frames=6, wrong_length=1)
+    assert stream.statistics == expected
+    (event,) = events_of(events, EventKind.PDO_LENGTH)
+    assert event.axis == 1
+
+
+def test_a_cut_frame_behind_the_last_cycle_is_counted(lockstep: Prepared) -> None:
+    stream, bus, _ = lockstep
+    cut_second(bus, 0x182, cycle=1)
+    assert missing_of_next(stream, 2) == [0, 0]
+    stream.read_on(0.05)
+    expected = StreamStatistics(cycles=2, frames=4, wrong_length=1)
+    assert stream.statistics == expected
+
+
 def test_frames_of_others_and_from_before_are_foreign(lockstep: Prepared) -> None:
     stream, bus, _ = lockstep
     # Before the first SYNC
@@ -794,6 +824,22 @@ def test_cycles_of_a_producer_that_goes_on_are_no_ones(followed: Followed) -> No
         producer.pulse()
     stream.read_on(0.05)
     expected = StreamStatistics(cycles=1, frames=2, duplicate=1)
+    assert stream.statistics == expected
+
+
+def test_a_cut_answer_to_a_sync_behind_the_last_cycle_is_counted(followed: Followed) -> None:
+    stream, bus, producer, _ = followed
+    next(stream)
+
+    def cut(message: can.Message) -> tuple[can.Message, ...]:
+        if message.arbitration_id == 0x182:
+            return (frame(0x182, bytes(7)),)
+        return (message,)
+
+    bus.tamper = cut
+    producer.pulse()
+    stream.read_on(0.05)
+    expected = StreamStatistics(cycles=1, frames=2, wrong_length=1)
     assert stream.statistics == expected
 
 
