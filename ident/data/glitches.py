@@ -47,10 +47,10 @@ JUMP_COUNTS = 20.0
 LEAST_CHANGES = 20
 NEAREST_STEP = 5  #: Steps from a jump to the nearest one that it is compared with, on either side
 FARTHEST_STEP = 14  #: Steps to the farthest one
-SHORT_READINGS = 3  #: Longest glitch of any shape, in readings
+SHORT_READINGS = 3  #: Longest glitch of any shape and duration, in readings
 LONGEST_GLITCH_S = 0.05
-"""Longest glitch of a position, which is continuous,
-and longest dropout of a current, which repeats one number.
+"""Longest glitch of more readings: of a position, which is continuous,
+or a dropout of a current, which repeats one number.
 """
 USUAL_PERCENTILES = 1.0, 99.0
 """Percentiles of a current between which its usual range is.
@@ -98,6 +98,17 @@ def smallest_change(values: FloatArray) -> float | None:
 
 
 @dataclass(frozen=True, slots=True)
+class GlitchLimits:
+    """Limits of the glitches of a channel."""
+
+    longest_samples: int  #: longest glitch of more than SHORT_READINGS
+    #: A current that repeats one number for longer than SHORT_READINGS usually last has a dropout
+    constant_samples: float
+    #: size that a glitch of a current of SHORT_READINGS or fewer exceeds, in its unit
+    short_size: float
+
+
+@dataclass(frozen=True, slots=True)
 class Glitch:
     """Successive readings that do not show what the channel measures."""
 
@@ -123,21 +134,17 @@ def find_jumps(readings: Readings, *, is_position: bool) -> Jumps:
         is_position: a position is continuous. A current may go up and down within some samples, so
             a longer glitch of a current repeats one number.
     """
+    percentile = CURRENT_PERCENTILE
     if is_position:
         percentile = POSITION_PERCENTILE
-        smallest = 0.0
-    else:
-        percentile = CURRENT_PERCENTILE
-        lowest, highest = np.percentile(readings.values, USUAL_PERCENTILES)
-        smallest = float(highest - lowest)
     step, size = _jumps(readings, percentile)
-    longest = max(SHORT_READINGS, round(LONGEST_GLITCH_S * readings.rate_hz))
+    limits = _glitch_limits(readings)
     glitches: list[Glitch] = []
     others: list[int] = []
     number = 0
     while number < len(step):
         found = _glitch_from(
-            readings, step[number:], size[number:], longest, smallest, is_position=is_position
+            readings, step[number:], size[number:], limits, is_position=is_position
         )
         if found is None:
             others.append(number)
@@ -147,6 +154,21 @@ def find_jumps(readings: Readings, *, is_position: bool) -> Jumps:
         glitches.append(glitch)
         number += used
     return Jumps(tuple(glitches), step[others], size[others])
+
+
+def _glitch_limits(readings: Readings) -> GlitchLimits:
+    """Return the limits of the glitches of a channel."""
+    lowest, highest = np.percentile(readings.values, USUAL_PERCENTILES)
+    stays = np.diff(readings.sample)  # samples from each reading to the next
+    held = stays[stays > 1]
+    usual_stay = 1.0
+    if len(held):
+        usual_stay = float(np.median(held))
+    return GlitchLimits(
+        longest_samples=round(LONGEST_GLITCH_S * readings.rate_hz),
+        constant_samples=SHORT_READINGS * usual_stay,
+        short_size=float(highest - lowest),
+    )
 
 
 def wrap_size(readings: Readings, jumps: Jumps, *, is_position: bool) -> float | None:
@@ -244,8 +266,7 @@ def _glitch_from(
     readings: Readings,
     step: IntArray,
     size: FloatArray,
-    longest: int,
-    smallest: float,
+    limits: GlitchLimits,
     *,
     is_position: bool,
 ) -> tuple[Glitch, int] | None:
@@ -255,8 +276,7 @@ def _glitch_from(
     Args:
         readings: of the channel.
         step, size: of the jumps that are left, as of `_jumps`.
-        longest: length of the longest glitch, in samples.
-        smallest: size that a glitch of SHORT_READINGS or fewer exceeds.
+        limits: of the glitches of the channel.
         is_position: as of `find_jumps`.
     """
     values = readings.values
@@ -266,15 +286,14 @@ def _glitch_from(
     signed_size = float(size[0])
     glitch_size = abs(signed_size)
     motion = float(values[first] - values[begin]) - signed_size
-    is_alone = len(step) == 1 or step[1] - begin > longest
+    is_alone = len(step) == 1 or _is_too_long(readings, begin, int(step[1]), limits)
     # Near an end of the recording, a position need not return to its course. A current that steps
     # there may be friction that turns.
     if is_position and begin < SHORT_READINGS and is_alone:
         return Glitch(0, first, glitch_size), 1
     for number in range(1, len(step)):
         last = int(step[number])
-        samples = int(readings.sample[last] - readings.sample[begin])
-        if samples > longest:
+        if _is_too_long(readings, begin, last, limits):
             break
         after = np.arange(last + 1, min(last + 1 + RETURNED_READINGS, count))
         # The course goes on from the reading before the glitch, with the motion around it.
@@ -282,13 +301,35 @@ def _glitch_from(
         if np.max(np.abs(off_course)) > RETURN_SHARE * glitch_size:
             continue
         inside = values[first : last + 1]
-        is_short = samples <= SHORT_READINGS and glitch_size > smallest
-        is_dropout = samples > SHORT_READINGS and np.ptp(inside) == 0.0
+        is_short = len(inside) <= SHORT_READINGS and glitch_size > limits.short_size
+        # A number that stays for many samples may be one reading: those that repeat it are held.
+        is_long = _samples_between(readings, begin, last) > limits.constant_samples
+        is_dropout = is_long and np.ptp(inside) == 0.0
         if is_position or is_short or is_dropout:
             return Glitch(first, last + 1, glitch_size), number + 1
     if is_position and count - 1 - begin <= SHORT_READINGS:
         return Glitch(first, count, glitch_size), len(step)
     return None
+
+
+def _is_too_long(readings: Readings, begin: int, last: int, limits: GlitchLimits) -> bool:
+    """Whether what is between two jumps is too long for a glitch.
+
+    Args:
+        readings: of the channel.
+        begin, last: number of the reading before each of the jumps.
+        limits: of the glitches of the channel.
+    """
+    if last - begin <= SHORT_READINGS:
+        return False
+    return _samples_between(readings, begin, last) > limits.longest_samples
+
+
+def _samples_between(readings: Readings, begin: int, last: int) -> int:
+    """Samples from the first reading after a jump to the first one after another; their numbers as
+    for `_is_too_long`.
+    """
+    return int(readings.sample[last + 1] - readings.sample[begin + 1])
 
 
 def upper_part(values: FloatArray) -> BoolArray | None:

@@ -275,6 +275,34 @@ def test_a_glitch_of_held_readings_is_a_reading() -> None:
     assert found.stretches.tolist() == [[1500, 1510]]
 
 
+def slowly_reported(channel: FloatArray) -> FloatArray:
+    """The channel with each fourth reading held for 4 ms."""
+    return channel[np.arange(SAMPLES) // 4 * 4]
+
+
+@pytest.mark.parametrize("size_a", [2.0, -2.0])
+def test_a_small_peak_of_a_slowly_reported_current_is_no_fault(size_a: float) -> None:
+    """A controller may ask for it where a joint breaks loose."""
+
+    def change(channel: FloatArray) -> None:
+        channel[:] = slowly_reported(channel)
+        channel[1500:1504] += size_a
+
+    position, current = damaged_current(change)
+    assert find_faults(position, current, RATE_HZ) == ()
+
+
+def test_a_dropout_of_a_slowly_reported_current_is_found() -> None:
+    def change(channel: FloatArray) -> None:
+        channel[:] = slowly_reported(channel)
+        channel[1500:1520] = channel[1500] + 2.0
+
+    position, current = damaged_current(change)
+    (found,) = find_faults(position, current, RATE_HZ)
+    assert place_of(found) == (FaultKind.GLITCH, ChannelKind.CURRENT, 1)
+    assert found.stretches.tolist() == [[1500, 1520]]
+
+
 def joints_of_coupled_motors(motor_rad: FloatArray) -> FloatArray:
     return np.asarray(motor_rad @ np.linalg.inv(COUPLED).T)
 
