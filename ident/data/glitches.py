@@ -206,12 +206,23 @@ def _share_in_middle(values: FloatArray) -> float:
 
 
 def _sizes_of_wraps(readings: Readings, step: IntArray) -> FloatArray:
-    """Size of each step less the motion, by the two steps on either side of it, shape (s,)."""
+    """Size of each step less the motion, shape (s,).
+
+    The motion is that of the two steps on either side, as far as there are any: a counter may wrap
+    so often that those farther away (`_jumps`) are wraps, too.
+    """
     steps = np.diff(readings.values)
-    neighbours = step[:, None] + np.array([-2, -1, 1, 2])
-    inside = np.clip(neighbours, 0, len(steps) - 1)
-    motion = np.median(steps[inside], axis=1)
+    neighbours = _steps_at(steps, step[:, None] + np.array([-2, -1, 1, 2]))
+    motion = np.nanmedian(neighbours, axis=1)
     return np.asarray(np.abs(steps[step] - motion))
+
+
+def _steps_at(steps: FloatArray, indices: IntArray) -> FloatArray:
+    """Steps at indices of any shape; NaN before the first step and after the last one."""
+    last = len(steps) - 1
+    is_outside = (indices < 0) | (indices > last)
+    inside = np.clip(indices, 0, last)
+    return np.where(is_outside, np.nan, steps[inside])
 
 
 def _jumps(readings: Readings, percentile: float) -> tuple[IntArray, FloatArray]:
@@ -226,18 +237,14 @@ def _jumps(readings: Readings, percentile: float) -> tuple[IntArray, FloatArray]
     """
     no_jumps = (np.zeros(0, dtype=np.int64), np.zeros(0))
     steps = np.diff(readings.values)
-    count = len(steps)
-    if count < 2 * FARTHEST_STEP:
+    if len(steps) < 2 * FARTHEST_STEP:
         return no_jumps
     suspects = _suspect_steps(steps, float(np.ptp(readings.values)), percentile)
     if not len(suspects):
         return no_jumps
     before = np.arange(-FARTHEST_STEP, -NEAREST_STEP + 1)
     after = np.arange(NEAREST_STEP, FARTHEST_STEP + 1)
-    indices = suspects[:, None] + np.concatenate((before, after))
-    is_outside = (indices < 0) | (indices >= count)
-    inside = np.clip(indices, 0, count - 1)
-    around = np.where(is_outside, np.nan, steps[inside])
+    around = _steps_at(steps, suspects[:, None] + np.concatenate((before, after)))
     motion = np.nanmedian(around, axis=1)
     distances = np.abs(around - motion[:, None])
     spread = np.nanpercentile(distances, SPREAD_PERCENTILE, axis=1)

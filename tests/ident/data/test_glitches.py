@@ -294,6 +294,13 @@ def test_a_current_that_friction_turns_between_two_values_is_no_counter() -> Non
     assert _range(square, is_position=False) is None
 
 
+@pytest.mark.parametrize("samples", [102, 202])
+def test_a_current_that_wraps_at_its_first_and_its_last_step_is_a_counter(samples: int) -> None:
+    # From 0.995 to 0.005 at the first step, and after each hundred to the last one
+    values = np.mod(0.995 + 0.01 * np.arange(samples), 1.0)
+    assert _range(values, is_position=False) == pytest.approx(1.0)
+
+
 # Signs that were lost
 
 
