@@ -1,9 +1,9 @@
 """Samples that leave the course of a channel and return to it,
 and steps after which it does not return.
 
-A motor does not turn back within a few samples, and its position goes on from where it was. A
-reading that does neither is none: a flipped bit, a lost frame, a sign that is wrong for a sample, a
-reading of zero where nothing was read. Where the channel does not return, the encoder has lost its
+A motor does not turn back within a few samples, and its position goes on from where it was. Values
+that break one of these rules are no readings: a flipped bit, a lost frame, a sign that is wrong for
+a sample, a zero where nothing was read. Where the channel does not return, the encoder has lost its
 place, or its counter has wrapped: it goes on, a fixed step away.
 
 A step is judged by the steps around it, so speed, noise and counts are those of the moment.
@@ -27,7 +27,7 @@ CURRENT_PERCENTILE = 98.0
 """That percentile of a current.
 
 A controller may ask for a current that lasts one sample: where a joint breaks loose, those of a
-real robot have up to 12 times the percentile, and ring on.
+real robot have up to 12 times the percentile. They ring on, and so are no glitches.
 """
 JUMP_RATIO = 10.0
 """Least difference of a jump from the steps around it, as a multiple of their spread.
@@ -35,7 +35,7 @@ JUMP_RATIO = 10.0
 Normal noise reaches 5 times.
 """
 SPREAD_PERCENTILE = 80.0
-"""Percentile that is the spread of the steps around a jump, of their distances from their median.
+"""Percentile of the distances of the steps around a jump from their median: their spread.
 
 A current that goes up and down with friction has many small steps among its large ones, and two
 other glitches may be near.
@@ -56,8 +56,8 @@ USUAL_PERCENTILES = 1.0, 99.0
 """Percentiles of a current between which its usual range is.
 
 A short glitch of a current is larger than that range. A controller may ask for a smaller current
-that lasts one reading, where a joint breaks loose: nothing tells it from a smaller glitch, which
-bends no gain.
+that lasts one reading, where a joint breaks loose. Nothing tells it from a glitch of that size, and
+such a glitch bends no gain.
 """
 RETURN_SHARE = 0.25  #: Largest distance from its course after a glitch, as a share of the glitch
 #: Readings after a glitch that must be on the course; what rings on is a blow to the robot
@@ -70,7 +70,7 @@ The middle is empty where negative numbers lost their sign; a counter that wraps
 """
 MIDDLE_TO = 0.75  #: End of that middle
 LEAST_PART_SHARE = 0.01  #: Least share of the values in a part of a range that is not empty
-WRAP_SHARE = 0.75  #: Least share of the range of a counter that was seen where it wraps
+WRAP_SHARE = 0.75  #: Least range of the readings of a counter that wraps, as a share of its range
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -122,7 +122,8 @@ class Jumps:
     """What a channel does that no motor does."""
 
     glitches: tuple[Glitch, ...]
-    step: IntArray  #: readings before the steps after which the channel does not return, shape (s,)
+    #: number of the reading before each step after which the channel does not return, shape (s,)
+    step: IntArray
     step_size: FloatArray  #: of each of them, less the motion, shape (s,)
 
 
@@ -140,20 +141,20 @@ def find_jumps(readings: Readings, *, is_position: bool) -> Jumps:
     step, size = _jumps(readings, percentile)
     limits = _glitch_limits(readings)
     glitches: list[Glitch] = []
-    others: list[int] = []
+    without_return: list[int] = []
     number = 0
     while number < len(step):
         found = _glitch_from(
             readings, step[number:], size[number:], limits, is_position=is_position
         )
         if found is None:
-            others.append(number)
+            without_return.append(number)
             number += 1
             continue
         glitch, used = found
         glitches.append(glitch)
         number += used
-    return Jumps(tuple(glitches), step[others], size[others])
+    return Jumps(tuple(glitches), step[without_return], size[without_return])
 
 
 def _glitch_limits(readings: Readings) -> GlitchLimits:
@@ -277,8 +278,10 @@ def _glitch_from(
     *,
     is_position: bool,
 ) -> tuple[Glitch, int] | None:
-    """Return the glitch that begins with the first of the jumps,
-    and how many of the jumps belong to it.
+    """Return the glitch that the first of the jumps begins,
+    and how many of the jumps belong to it; None where it begins none.
+
+    A position may begin with a glitch: then the first of the jumps ends it.
 
     Args:
         readings: of the channel.
