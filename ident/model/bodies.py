@@ -160,7 +160,8 @@ def _require_possible_inertia(payload: Payload) -> None:
     second_moments = pseudo[:3, :3]
     if set(known) != set(LINK_PARAMETERS):
         pseudo = second_moments
-    size = max(float(np.trace(second_moments)), 0.0)
+    # The sum of the eigenvalues' sizes: the trace for a body
+    size = float(np.linalg.norm(second_moments, "nuc"))
     # The rows of the second moments and of the mass have other units: compare them at a common
     # size.
     scale = np.ones(len(pseudo))
