@@ -343,7 +343,8 @@ def _fit_moves(position: FloatArray, stops: Sequence[_Stop], rate_hz: float) -> 
     times_s: list[FloatArray] = []
     shares: list[FloatArray] = []
     for start, end in pairwise(stops):
-        last = end.sample - 1 - start.sample
+        # The last move of a slow recording may have one sample; its fit takes the one after, too.
+        last = max(end.sample - 1 - start.sample, 1)
         samples = np.rint(share_of_time * last).astype(np.int64)
         travelled = position[start.sample + samples] - start.position
         times_s.append(samples / rate_hz)
