@@ -294,10 +294,9 @@ def replaced_samples(
         if one.quantity is not quantity or not is_replaced:
             continue
         columns = np.array([one.axis])
-        if turned_by is not None:
-            # The axis is that of a motor, or of a joint whose own encoder was read.
-            joints_of_motor = np.flatnonzero(turned_by[:, one.axis])
-            columns = np.union1d(columns, joints_of_motor)
+        # A joint whose own encoder was read is a column itself; a motor turns one or several.
+        if turned_by is not None and one.unit != JOINT_UNIT:
+            columns = np.flatnonzero(turned_by[:, one.axis])
         for first, end in one.stretches.tolist():
             marked[first:end, columns] = True
     return marked

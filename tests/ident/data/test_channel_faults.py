@@ -338,6 +338,19 @@ def test_frozen_encoders_of_two_joints_of_a_differential_are_both_found() -> Non
     ]
 
 
+@pytest.mark.parametrize("joint", [0, 1])
+def test_a_frozen_encoder_of_a_joint_of_a_differential_costs_no_reading_of_the_other(
+    joint: int,
+) -> None:
+    motor_rad, current = sound()
+    joint_rad = np.linalg.solve(DIFFERENTIAL, motor_rad.T).T
+    joint_rad[1500:1800, joint] = joint_rad[1500, joint]
+    faults = find_faults(joint_rad, current, RATE_HZ, DIFFERENTIAL)
+    filled = mended(joint_rad, faults, RATE_HZ, DIFFERENTIAL)
+    is_filled = np.any(filled != joint_rad, axis=0)
+    assert np.flatnonzero(is_filled).tolist() == [joint]
+
+
 def test_what_is_known_to_be_missing_is_no_finding() -> None:
     position, current = damaged_position(zeroed(1500, 1540))
     usable = np.ones(position.shape, dtype=np.bool_)
