@@ -28,7 +28,8 @@ from ident.model.closed_chain import Assembly, assemble, null_space, towards_clo
 from ident.model.closures import joint_axes, loops, spin
 from ident.model.robot import Closure, JointKind, Motion, Pivot, Poses, Robot, joints_to_base, poses
 
-#: Difference of two joints' speeds, relative to the largest, below which they turn alike
+#: Difference of two joints' speeds, relative to the largest, below which they turn alike; also the
+#: speed of a pivot, relative to the largest of a joint, below which it does not turn
 ALIKE_TOLERANCE = 1e-7
 PARALLEL_SINE = 1e-6  #: Sine of the angle between two axes that count as parallel
 DISTANCES_FROM_ASSEMBLY = (0.0, 0.06, -0.09)
@@ -59,11 +60,14 @@ def cut_pivots(robot: Robot) -> tuple[Pivot, ...]:
         return ()
     speeds = _speeds_near(replace(robot, pivots=turning), assembly)
     count = robot.joint_count
-    known = [speeds[:, joint] for joint in range(count)]
+    of_joints = speeds[:, :count]
+    known = list(of_joints.T)
+    # Where the joints of a loop turn against each other, a pivot at rest has a rounding error.
+    least_speed = ALIKE_TOLERANCE * float(np.abs(of_joints).max())
     found: list[Pivot] = []
     for number, pivot in enumerate(turning):
         speed = speeds[:, count + number]
-        turns = float(np.abs(speed).max()) > 0.0
+        turns = float(np.abs(speed).max()) > least_speed
         is_known = any(_turn_alike(speed, other) for other in known)
         if turns and not is_known:
             found.append(pivot)
