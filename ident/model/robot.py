@@ -41,7 +41,7 @@ class Joint:
     translation_m: FloatArray  #: its origin there, (3,)
     axis: FloatArray  #: unit vector of the motion in the joint frame, (3,)
     #: Distance from the lowest to the highest position that its description allows [rad or m]; None
-    #: where it has no limits. Positions in another unit go far beyond it.
+    #: where it has no limits. Recorded positions that go far beyond it are in another unit.
     travel: float | None = None
     #: Lowest position that its description allows [rad or m]; None where it has no limits.
     lowest: float | None = None
@@ -116,7 +116,7 @@ class Robot:
     """
 
     joints: tuple[Joint, ...]  #: depth first from the base
-    #: in the base frame, shape (3,); any mounting of the base is a direction of gravity
+    #: in the base frame, shape (3,): of a base on a wall or a ceiling, it points another way
     gravity_m_s2: FloatArray
     closures: tuple[Closure, ...] = ()  #: none of a serial robot
     #: joint that each axis drives, in the order of the axes; empty: every joint is driven
@@ -379,7 +379,9 @@ class Motion:
     velocity_rad_s: FloatArray  #: q̇, per s
     acceleration_rad_s2: FloatArray  #: q̈, per s²
 
-    if TYPE_CHECKING:  # whatever becomes an array
+    if (
+        TYPE_CHECKING
+    ):  # `__post_init__` takes whatever becomes an array, so type checkers must, too.
 
         def __init__(
             self, position_rad: ArrayLike, velocity_rad_s: ArrayLike, acceleration_rad_s2: ArrayLike
@@ -457,15 +459,16 @@ def _rotations_in_parent(robot: Robot, position_rad: FloatArray) -> FloatArray:
     """
     joints = robot.joints
     axes = np.array([joint.axis for joint in joints])
-    fixed = np.array([joint.rotation for joint in joints])
+    at_zero = np.array([joint.rotation for joint in joints])  # R₀
     is_revolute = np.array([joint.kind is JointKind.REVOLUTE for joint in joints])
     outer = axes[:, :, None] * axes[:, None]
     crosses = np.array([skew(axis) for axis in axes])
     across = np.eye(3) - outer
     terms = np.stack((outer, across, crosses), axis=1)
-    terms_in_parent = fixed[:, None] @ terms
+    terms_in_parent = at_zero[:, None] @ terms
     angle = position_rad.T * is_revolute[:, None]
     factors = np.stack((np.ones_like(angle), np.cos(angle), np.sin(angle)), axis=2)
+    # (n, k, 3 terms) @ (n, 3 terms, 9) is (n, k, 9)
     rotations = factors @ terms_in_parent.reshape(-1, 3, 9)
     return np.asarray(rotations.reshape(*angle.shape, 3, 3))
 
