@@ -159,17 +159,19 @@ def _require_possible_inertia(payload: Payload) -> None:
         return
     pseudo = pseudo_inertia(payload.known_parameters)
     second_moments = pseudo[:3, :3]
-    if set(known) != set(LINK_PARAMETERS):
-        pseudo = second_moments
+    judged = second_moments
+    if set(known) == set(LINK_PARAMETERS):
+        judged = pseudo
     # The sum of the eigenvalues' sizes: the trace for a body
     size = float(np.linalg.norm(second_moments, "nuc"))
     # The rows of the second moments and of the mass have other units: compare them at a common
     # size.
-    scale = np.ones(len(pseudo))
+    scale = np.ones(len(judged))
     if size > 0.0:
         scale[:3] = np.sqrt(size)
-    scale[3:] = np.sqrt(known.get("m", 1.0))
-    scaled = pseudo / np.outer(scale, scale)
+    if judged is pseudo:
+        scale[3] = np.sqrt(known["m"])
+    scaled = judged / np.outer(scale, scale)
     eigenvalues = np.linalg.eigvalsh(scaled)
     smallest = float(eigenvalues[0])
     if smallest >= -DRAWING_ROUNDING:
