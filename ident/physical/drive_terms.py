@@ -24,7 +24,7 @@ from scipy.optimize import nnls
 
 from ident.arrays import FloatArray
 from ident.model.bodies import LOADED
-from ident.model.model import COUPLED_COLUMNS, JOINT_COLUMNS, Model
+from ident.model.model import COUPLED_COLUMNS, Model
 
 ROUNDING = 1e-12  #: Share of a parameter up to which what is left of it is rounding error
 
@@ -74,12 +74,10 @@ def drive_terms(model: Model, standard: FloatArray) -> DriveTerms:
         standard: χ_st without payload, shape (c,).
     """
     coupled = list(model.drive_train.coupled)
-    first = JOINT_COLUMNS * model.robot.joint_count
-    end = first + COUPLED_COLUMNS * len(coupled)
-    of_coupled = slice(first, end)
-    # Iam, fvm and fsm of each motor
+    # Columns of Iam, fvm and fsm of each coupled motor
+    of_coupled = model.coupled_columns[:, None] + np.arange(COUPLED_COLUMNS)
     of_motors = np.zeros((model.robot.axis_count, COUPLED_COLUMNS))
-    of_motors[coupled] = standard[of_coupled].reshape(-1, COUPLED_COLUMNS)
+    of_motors[coupled] = standard[of_coupled]
     rotors = standard[model.rotor_columns]
     viscous = standard[model.viscous_friction_columns]
     dry = standard[model.dry_friction_columns]
@@ -101,7 +99,7 @@ def drive_terms(model: Model, standard: FloatArray) -> DriveTerms:
     # Other parameters of the coupled motors give the same torque as the identified ones
     # (`_not_negative`), so what is missing is judged by them.
     same_torque = standard.copy()
-    same_torque[of_coupled] = of_motors[coupled].ravel()
+    same_torque[of_coupled] = of_motors[coupled]
     missing = same_torque - _standard_of(model, inertia, damping, dry_friction)
     missing[model.link_columns] = 0.0
     left_over: list[LeftOver] = []
@@ -166,10 +164,9 @@ def _standard_of(model: Model, inertia: Terms, damping: Terms, dry_friction: Ter
     standard[model.rotor_columns] = inertia.of_axes + inertia.of_motors @ squares
     standard[model.viscous_friction_columns] = damping.of_axes + damping.of_motors @ squares
     standard[model.dry_friction_columns] = dry_friction.of_axes
-    first = JOINT_COLUMNS * model.robot.joint_count
-    for motor in model.drive_train.coupled:
+    of_coupled = zip(model.coupled_columns.tolist(), model.drive_train.coupled, strict=True)
+    for first, motor in of_coupled:
         standard[first + INERTIA] = inertia.of_motors[motor]
         standard[first + VISCOUS] = damping.of_motors[motor]
         standard[first + DRY] = dry_friction.of_motors[motor]
-        first += COUPLED_COLUMNS
     return standard
