@@ -96,12 +96,19 @@ class ChannelUnfit(DataUnfit):
 class CurrentUnsigned(ChannelUnfit):
     """Drives report the size of the current only."""
 
-    def __init__(self, run: str, axes: tuple[str, ...], missing_sign: str) -> None:
+    def __init__(self, run: str, axes: tuple[str, ...], missing_signs: tuple[str, ...]) -> None:
+        # Axis names by the sign that their currents lack
+        axes_by_sign: dict[str, list[str]] = {}
+        for axis, sign in zip(axes, missing_signs, strict=True):
+            axes_by_sign.setdefault(sign, []).append(axis)
+        clauses = [f"never {sign} ({', '.join(found)})" for sign, found in axes_by_sign.items()]
+        if len(axes_by_sign) == 1:
+            clauses = [f"never {missing_signs[0]}"]
         super().__init__(
             run,
             axes,
-            found=f"currents that are never {missing_sign} while the axes move both ways, and that "
-            "no load which is always carried explains",
+            found=f"currents that are {' or '.join(clauses)} while the axes move both ways, and "
+            "that no load which is always carried explains",
             expected="a current with its sign: that of the torque",
             remedy="the drive, or the export, gives the size of the current only; take its signed "
             "value",

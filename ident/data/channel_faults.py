@@ -36,7 +36,8 @@ position.
 """
 MOTOR_UNIT = "rad of the motor"
 JOINT_UNIT = "rad or m of the joint"
-MOTOR_ANGLE_DIGITS = 12  #: Decimals of a motor angle of several joints, in units of its largest sum
+MOTOR_ANGLE_DIGITS = 12
+"""Decimals of a motor angle of several joints, in units of the largest Σ |R| |q|."""
 
 
 class ChannelKind(Enum):
@@ -65,7 +66,9 @@ class ChannelFault:
     quantity: ChannelKind
     axis: int  #: index of the motor, or of the joint where the unit is JOINT_UNIT
     stretches: IntArray  #: first sample and end of each, shape (s, 2)
-    #: largest distance from the course, or the range of a counter, in the unit of the channel
+    #: In the unit of the channel: largest distance of a glitch from the values around it, range of
+    #: a counter that wraps, usual step of an unsigned one, largest step of one that is displaced; 0
+    #: of one that is frozen or clipped
     size: float
     samples: int  #: of the recording
     rate_hz: float  #: of the recording
@@ -89,8 +92,8 @@ class ChannelFault:
             return self.share > LARGEST_GLITCHED_SHARE
         if self.kind is FaultKind.FROZEN:
             return self.share > LARGEST_FROZEN_SHARE
-        # A clipped position may be that of a joint that a simple device has stopped at the end of
-        # its range. What else there is cannot be mended.
+        # A clipped position may be right: a simple device may have stopped the joint at the end of
+        # its range. The other kinds cannot be mended.
         return self.kind is not FaultKind.CLIPPED
 
     @property
@@ -162,7 +165,7 @@ class JudgedChannels:
     faults: tuple[ChannelFault, ...]
 
     def answers_for(self, position: object, current: object, ratio: FloatArray) -> bool:
-        """Whether these are the arrays that were judged, not copies; the ratio is (m, m)."""
+        """Whether these are the arrays that were judged, not copies of them, and R is the same."""
         are_same_arrays = position is self.position and current is self.current
         return are_same_arrays and np.array_equal(ratio, self.ratio)
 
@@ -224,9 +227,10 @@ def _with_coupled_joints(
 ) -> list[ChannelFault]:
     """Add the faults of joints that several motors turn: their encoders may be at the joints.
 
-    A joint is judged where its motors have no fault, or are only displaced. The position of a joint
-    that freezes and goes on steps, and so do those of its motors. Where the joint is found frozen
-    or clipped, its fault takes the place of the motors' steps.
+    A joint is judged where its motors have no fault, or are only displaced. Where the encoder of a
+    joint freezes and later goes on, the position jumps at the end, and so do those of its motors.
+    Where the joint is found frozen or clipped, its fault takes the place of the motors' steps.
+    Other faults of the joint are added only where its motors have none.
 
     Args:
         motors: faults of the positions of the motors.
@@ -257,8 +261,9 @@ def refused_fault(faults: Sequence[ChannelFault], *, displaced: bool) -> Channel
 
     Args:
         faults: of the recording.
-        displaced: look for positions that go on displaced, of which the limits of the robot may say
-            more; else for all others.
+        displaced: whether to look for positions that go on displaced, or for every other fault.
+            The limits of the robot may explain a displaced position better, so a caller looks for
+            the other faults first, then at the limits, then for these.
     """
     for one in faults:
         if one.is_refused and (one.kind is FaultKind.DISPLACED) is displaced:
@@ -294,10 +299,9 @@ def replaced_samples(
         if one.quantity is not quantity or not is_replaced:
             continue
         columns = np.array([one.axis])
-        if turned_by is not None:
-            # The axis is that of a motor, or of a joint whose own encoder was read.
-            joints_of_motor = np.flatnonzero(turned_by[:, one.axis])
-            columns = np.union1d(columns, joints_of_motor)
+        # A joint whose own encoder was read is a column itself; a motor turns one or several.
+        if turned_by is not None and one.unit != JOINT_UNIT:
+            columns = np.flatnonzero(turned_by[:, one.axis])
         for first, end in one.stretches.tolist():
             marked[first:end, columns] = True
     return marked
@@ -311,8 +315,8 @@ def mended(
     quantity: ChannelKind = ChannelKind.POSITION,
     time: FloatArray | None = None,
 ) -> FloatArray:
-    """Return channels, shape (k, n), with the samples replaced that are no readings;
-    the same array where there are none.
+    """Return channels, shape (k, n), in which samples that are no readings are replaced by those
+    around them; the same array where every sample is a reading.
 
     Args:
         values: positions or currents, as of `find_faults`.
@@ -388,7 +392,7 @@ class ChannelPlace:
 
 
 def _readings(channels: FloatArray, rate_hz: float) -> Iterator[Readings]:
-    """Yield the readings of each channel, shape (k, c), without samples that only hold one.
+    """Yield the readings of each channel, shape (k, c), without samples that repeat a reading.
 
     Where a channel changes too seldom to show its count, the coarsest count of the others is taken.
     """
@@ -416,7 +420,8 @@ def _position_faults(
 
     Args:
         readings: of the position.
-        others: positions of the other columns, shape (k, n − 1).
+        others: positions of the other columns, shape (k, n − 1). Where none of them moves any more,
+            a position that stays to the end is at rest, not frozen.
         place: which channel it is.
     """
     jumps = find_jumps(readings, is_position=True)
@@ -450,7 +455,8 @@ def _lost_place(readings: Readings, jumps: Jumps, frozen: IntArray) -> BoolArray
     without those at the ends of frozen stretches.
     """
     is_large = np.abs(jumps.step_size) > LOST_PLACE_RATIO * usual_step(readings)
-    # The end of a stretch is the sample after its last one.
+    # A step leaves a stretch where the sample after the one before the step is the stretch's end,
+    # and enters it where the sample after the step is the stretch's first.
     leaves_frozen = np.isin(readings.sample[jumps.step] + 1, frozen)
     enters_frozen = np.isin(readings.sample[jumps.step + 1], frozen)
     is_end_of_frozen = leaves_frozen | enters_frozen
@@ -469,6 +475,7 @@ def _current_faults(
     """
     upper = upper_part(readings.values)
     if upper is not None:
+        # Over the empty middle, most steps are about as long as the counter's range.
         step = np.flatnonzero(np.diff(upper))
         changes = np.diff(readings.values)
         size = float(np.median(np.abs(changes[step])))
@@ -499,7 +506,7 @@ def _glitched(readings: Readings, jumps: Jumps) -> IntArray:
 
 
 def _largest_glitch(jumps: Jumps) -> float:
-    """Largest distance of a glitch from the course."""
+    """Largest distance of a glitch from the values around it."""
     return max(one.size for one in jumps.glitches)
 
 

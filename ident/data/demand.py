@@ -41,8 +41,8 @@ SHORTEST_MOVE_SHARE = 0.01
 #: Samples of each move that its fit uses: about twenty for each unknown
 FIT_SAMPLES = 64
 FIT_ITERATIONS = 25
-#: Largest number of stops for each rest, at which moves are split no further: a continuous motion
-#: would be split without end
+#: Moves are split no further once there are more stops than this number times the rests: a
+#: continuous motion would be split without end
 MAX_STOPS_PER_REST = 4
 #: Share of a motor's squared velocity that its trapezoids follow where every rest was found
 WELL_FOLLOWED = 0.98
@@ -343,7 +343,8 @@ def _fit_moves(position: FloatArray, stops: Sequence[_Stop], rate_hz: float) -> 
     times_s: list[FloatArray] = []
     shares: list[FloatArray] = []
     for start, end in pairwise(stops):
-        last = end.sample - 1 - start.sample
+        # The last move of a slow recording may have one sample; its fit takes the one after, too.
+        last = max(end.sample - 1 - start.sample, 1)
         samples = np.rint(share_of_time * last).astype(np.int64)
         travelled = position[start.sample + samples] - start.position
         times_s.append(samples / rate_hz)
@@ -372,7 +373,8 @@ def _fit_trapezoids(time_s: FloatArray, share: FloatArray) -> FloatArray:
     cost = np.sum(residual**2, axis=1)
     damping = np.full(len(share), 1e-3)
     for _ in range(FIT_ITERATIONS):
-        jacobian = _share_jacobian(time_s, parameters, share - residual)
+        fitted_share = share - residual
+        jacobian = _share_jacobian(time_s, parameters, fitted_share)
         transposed = np.swapaxes(jacobian, 1, 2)
         # (JᵀJ + (λ tr JᵀJ + ε) 1) Δ = Jᵀ r of each move
         gram = transposed @ jacobian
@@ -405,9 +407,9 @@ def _share_jacobian(time_s: FloatArray, parameters: FloatArray, share: FloatArra
     """
     duration = parameters[:, 2]
     changed_shares: list[FloatArray] = []
-    for parameter in np.eye(3):
-        share_of_duration = DERIVATIVE_STEP * parameter
-        changed = parameters + share_of_duration * duration[:, None]
+    for one_parameter in np.eye(3):
+        change = DERIVATIVE_STEP * duration[:, None] * one_parameter
+        changed = parameters + change
         changed_shares.append(_distance_share(time_s, changed))
     step = DERIVATIVE_STEP * duration
     difference = np.stack(changed_shares, axis=2) - share[:, :, None]

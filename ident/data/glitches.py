@@ -1,9 +1,9 @@
 """Samples that leave the course of a channel and return to it,
 and steps after which it does not return.
 
-A motor does not turn back within a few samples, and its position goes on from where it was. A
-reading that does neither is none: a flipped bit, a lost frame, a sign that is wrong for a sample, a
-reading of zero where nothing was read. Where the channel does not return, the encoder has lost its
+A motor does not turn back within a few samples, and its position goes on from where it was. Values
+that break one of these rules are no readings: a flipped bit, a lost frame, a sign that is wrong for
+a sample, a zero where nothing was read. Where the channel does not return, the encoder has lost its
 place, or its counter has wrapped: it goes on, a fixed step away.
 
 A step is judged by the steps around it, so speed, noise and counts are those of the moment.
@@ -27,7 +27,7 @@ CURRENT_PERCENTILE = 98.0
 """That percentile of a current.
 
 A controller may ask for a current that lasts one sample: where a joint breaks loose, those of a
-real robot have up to 12 times the percentile, and ring on.
+real robot have up to 12 times the percentile. They ring on, and so are no glitches.
 """
 JUMP_RATIO = 10.0
 """Least difference of a jump from the steps around it, as a multiple of their spread.
@@ -35,7 +35,7 @@ JUMP_RATIO = 10.0
 Normal noise reaches 5 times.
 """
 SPREAD_PERCENTILE = 80.0
-"""Percentile that is the spread of the steps around a jump, of their distances from their median.
+"""Percentile of the distances of the steps around a jump from their median: their spread.
 
 A current that goes up and down with friction has many small steps among its large ones, and two
 other glitches may be near.
@@ -47,17 +47,17 @@ JUMP_COUNTS = 20.0
 LEAST_CHANGES = 20
 NEAREST_STEP = 5  #: Steps from a jump to the nearest one that it is compared with, on either side
 FARTHEST_STEP = 14  #: Steps to the farthest one
-SHORT_READINGS = 3  #: Longest glitch of any shape, in readings
+SHORT_READINGS = 3  #: Longest glitch of any shape and duration, in readings
 LONGEST_GLITCH_S = 0.05
-"""Longest glitch of a position, which is continuous,
-and longest dropout of a current, which repeats one number.
+"""Longest glitch of more readings: of a position, which is continuous,
+or a dropout of a current, which repeats one number.
 """
 USUAL_PERCENTILES = 1.0, 99.0
 """Percentiles of a current between which its usual range is.
 
 A short glitch of a current is larger than that range. A controller may ask for a smaller current
-that lasts one reading, where a joint breaks loose: nothing tells it from a smaller glitch, which
-bends no gain.
+that lasts one reading, where a joint breaks loose. Nothing tells it from a glitch of that size, and
+such a glitch bends no gain.
 """
 RETURN_SHARE = 0.25  #: Largest distance from its course after a glitch, as a share of the glitch
 #: Readings after a glitch that must be on the course; what rings on is a blow to the robot
@@ -70,7 +70,7 @@ The middle is empty where negative numbers lost their sign; a counter that wraps
 """
 MIDDLE_TO = 0.75  #: End of that middle
 LEAST_PART_SHARE = 0.01  #: Least share of the values in a part of a range that is not empty
-WRAP_SHARE = 0.75  #: Least share of the range of a counter that was seen where it wraps
+WRAP_SHARE = 0.75  #: Least range of the readings of a counter that wraps, as a share of its range
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -98,6 +98,17 @@ def smallest_change(values: FloatArray) -> float | None:
 
 
 @dataclass(frozen=True, slots=True)
+class GlitchLimits:
+    """Limits of the glitches of a channel."""
+
+    longest_samples: int  #: longest glitch of more than SHORT_READINGS
+    #: A current that repeats one number for longer than SHORT_READINGS usually last has a dropout
+    constant_samples: float
+    #: size that a glitch of a current of SHORT_READINGS or fewer exceeds, in its unit
+    short_size: float
+
+
+@dataclass(frozen=True, slots=True)
 class Glitch:
     """Successive readings that do not show what the channel measures."""
 
@@ -111,7 +122,8 @@ class Jumps:
     """What a channel does that no motor does."""
 
     glitches: tuple[Glitch, ...]
-    step: IntArray  #: readings before the steps after which the channel does not return, shape (s,)
+    #: number of the reading before each step after which the channel does not return, shape (s,)
+    step: IntArray
     step_size: FloatArray  #: of each of them, less the motion, shape (s,)
 
 
@@ -123,30 +135,41 @@ def find_jumps(readings: Readings, *, is_position: bool) -> Jumps:
         is_position: a position is continuous. A current may go up and down within some samples, so
             a longer glitch of a current repeats one number.
     """
+    percentile = CURRENT_PERCENTILE
     if is_position:
         percentile = POSITION_PERCENTILE
-        smallest = 0.0
-    else:
-        percentile = CURRENT_PERCENTILE
-        lowest, highest = np.percentile(readings.values, USUAL_PERCENTILES)
-        smallest = float(highest - lowest)
     step, size = _jumps(readings, percentile)
-    longest = max(SHORT_READINGS, round(LONGEST_GLITCH_S * readings.rate_hz))
+    limits = _glitch_limits(readings)
     glitches: list[Glitch] = []
-    others: list[int] = []
+    without_return: list[int] = []
     number = 0
     while number < len(step):
         found = _glitch_from(
-            readings, step[number:], size[number:], longest, smallest, is_position=is_position
+            readings, step[number:], size[number:], limits, is_position=is_position
         )
         if found is None:
-            others.append(number)
+            without_return.append(number)
             number += 1
             continue
         glitch, used = found
         glitches.append(glitch)
         number += used
-    return Jumps(tuple(glitches), step[others], size[others])
+    return Jumps(tuple(glitches), step[without_return], size[without_return])
+
+
+def _glitch_limits(readings: Readings) -> GlitchLimits:
+    """Return the limits of the glitches of a channel."""
+    lowest, highest = np.percentile(readings.values, USUAL_PERCENTILES)
+    stays = np.diff(readings.sample)  # samples from each reading to the next
+    held = stays[stays > 1]
+    usual_stay = 1.0
+    if len(held):
+        usual_stay = float(np.median(held))
+    return GlitchLimits(
+        longest_samples=round(LONGEST_GLITCH_S * readings.rate_hz),
+        constant_samples=SHORT_READINGS * usual_stay,
+        short_size=float(highest - lowest),
+    )
 
 
 def wrap_size(readings: Readings, jumps: Jumps, *, is_position: bool) -> float | None:
@@ -184,12 +207,23 @@ def _share_in_middle(values: FloatArray) -> float:
 
 
 def _sizes_of_wraps(readings: Readings, step: IntArray) -> FloatArray:
-    """Size of each step less the motion, by the two steps on either side of it, shape (s,)."""
+    """Size of each step less the motion, shape (s,).
+
+    The motion is that of the two steps on either side, as far as there are any: a counter may wrap
+    so often that those farther away (`_jumps`) are wraps, too.
+    """
     steps = np.diff(readings.values)
-    neighbours = step[:, None] + np.array([-2, -1, 1, 2])
-    inside = np.clip(neighbours, 0, len(steps) - 1)
-    motion = np.median(steps[inside], axis=1)
+    neighbours = _steps_at(steps, step[:, None] + np.array([-2, -1, 1, 2]))
+    motion = np.nanmedian(neighbours, axis=1)
     return np.asarray(np.abs(steps[step] - motion))
+
+
+def _steps_at(steps: FloatArray, indices: IntArray) -> FloatArray:
+    """Steps at indices of any shape; NaN before the first step and after the last one."""
+    last = len(steps) - 1
+    is_outside = (indices < 0) | (indices > last)
+    inside = np.clip(indices, 0, last)
+    return np.where(is_outside, np.nan, steps[inside])
 
 
 def _jumps(readings: Readings, percentile: float) -> tuple[IntArray, FloatArray]:
@@ -204,18 +238,14 @@ def _jumps(readings: Readings, percentile: float) -> tuple[IntArray, FloatArray]
     """
     no_jumps = (np.zeros(0, dtype=np.int64), np.zeros(0))
     steps = np.diff(readings.values)
-    count = len(steps)
-    if count < 2 * FARTHEST_STEP:
+    if len(steps) < 2 * FARTHEST_STEP:
         return no_jumps
     suspects = _suspect_steps(steps, float(np.ptp(readings.values)), percentile)
     if not len(suspects):
         return no_jumps
     before = np.arange(-FARTHEST_STEP, -NEAREST_STEP + 1)
     after = np.arange(NEAREST_STEP, FARTHEST_STEP + 1)
-    indices = suspects[:, None] + np.concatenate((before, after))
-    is_outside = (indices < 0) | (indices >= count)
-    inside = np.clip(indices, 0, count - 1)
-    around = np.where(is_outside, np.nan, steps[inside])
+    around = _steps_at(steps, suspects[:, None] + np.concatenate((before, after)))
     motion = np.nanmedian(around, axis=1)
     distances = np.abs(around - motion[:, None])
     spread = np.nanpercentile(distances, SPREAD_PERCENTILE, axis=1)
@@ -244,19 +274,19 @@ def _glitch_from(
     readings: Readings,
     step: IntArray,
     size: FloatArray,
-    longest: int,
-    smallest: float,
+    limits: GlitchLimits,
     *,
     is_position: bool,
 ) -> tuple[Glitch, int] | None:
-    """Return the glitch that begins with the first of the jumps,
-    and how many of the jumps belong to it.
+    """Return the glitch that the first of the jumps begins,
+    and how many of the jumps belong to it; None where it begins none.
+
+    A position may begin with a glitch: then the first of the jumps ends it.
 
     Args:
         readings: of the channel.
         step, size: of the jumps that are left, as of `_jumps`.
-        longest: length of the longest glitch, in samples.
-        smallest: size that a glitch of SHORT_READINGS or fewer exceeds.
+        limits: of the glitches of the channel.
         is_position: as of `find_jumps`.
     """
     values = readings.values
@@ -266,15 +296,14 @@ def _glitch_from(
     signed_size = float(size[0])
     glitch_size = abs(signed_size)
     motion = float(values[first] - values[begin]) - signed_size
-    is_alone = len(step) == 1 or step[1] - begin > longest
+    is_alone = len(step) == 1 or _is_too_long(readings, begin, int(step[1]), limits)
     # Near an end of the recording, a position need not return to its course. A current that steps
     # there may be friction that turns.
     if is_position and begin < SHORT_READINGS and is_alone:
         return Glitch(0, first, glitch_size), 1
     for number in range(1, len(step)):
         last = int(step[number])
-        samples = int(readings.sample[last] - readings.sample[begin])
-        if samples > longest:
+        if _is_too_long(readings, begin, last, limits):
             break
         after = np.arange(last + 1, min(last + 1 + RETURNED_READINGS, count))
         # The course goes on from the reading before the glitch, with the motion around it.
@@ -282,13 +311,35 @@ def _glitch_from(
         if np.max(np.abs(off_course)) > RETURN_SHARE * glitch_size:
             continue
         inside = values[first : last + 1]
-        is_short = samples <= SHORT_READINGS and glitch_size > smallest
-        is_dropout = samples > SHORT_READINGS and np.ptp(inside) == 0.0
+        is_short = len(inside) <= SHORT_READINGS and glitch_size > limits.short_size
+        # A number that stays for many samples may be one reading: those that repeat it are held.
+        is_long = _samples_between(readings, begin, last) > limits.constant_samples
+        is_dropout = is_long and np.ptp(inside) == 0.0
         if is_position or is_short or is_dropout:
             return Glitch(first, last + 1, glitch_size), number + 1
     if is_position and count - 1 - begin <= SHORT_READINGS:
         return Glitch(first, count, glitch_size), len(step)
     return None
+
+
+def _is_too_long(readings: Readings, begin: int, last: int, limits: GlitchLimits) -> bool:
+    """Whether what is between two jumps is too long for a glitch.
+
+    Args:
+        readings: of the channel.
+        begin, last: number of the reading before each of the jumps.
+        limits: of the glitches of the channel.
+    """
+    if last - begin <= SHORT_READINGS:
+        return False
+    return _samples_between(readings, begin, last) > limits.longest_samples
+
+
+def _samples_between(readings: Readings, begin: int, last: int) -> int:
+    """Samples from the first reading after a jump to the first one after another; their numbers as
+    for `_is_too_long`.
+    """
+    return int(readings.sample[last + 1] - readings.sample[begin + 1])
 
 
 def upper_part(values: FloatArray) -> BoolArray | None:

@@ -28,8 +28,11 @@ currents with a sign, shifted until they have one sign alone, make 4 at most.
 """
 #: Smallest count of a coarse current, as a share of its usual largest size
 COARSE_COUNT_SHARE = 0.05
-#: Least visits of a coarse current: rounding takes one that has its sign to zero, up to 6 times
 LEAST_COARSE_VISITS = 12
+"""Least visits of a coarse current: twice those of one that has its sign.
+
+Rounding takes such a current to zero, up to 6 times.
+"""
 LEAST_PAUSE_S = 0.1  #: Least time between two visits
 LONGEST_VISIT_S = 0.05
 """Longest time for which the current keeps one value in a visit.
@@ -45,6 +48,7 @@ parabola, with 4.
 #: Least rise over the time t, as a share of the usual largest size
 RISE_SHARE = 0.1
 LONGEST_RISE_S = 0.3  #: Largest t
+LAGS = 40  #: Number of values of t that are tried, in a geometric series
 #: Least way in each direction of a motor that turns both ways, as a share of its whole way
 LEAST_WAY_SHARE = 0.1
 
@@ -71,17 +75,26 @@ def refuse_unsigned(run: Run, unsigned: BoolArray, axes: Sequence[str]) -> None:
         CurrentUnsigned: for these currents.
     """
     if unsigned.any():
-        names = tuple(axis for axis, found in zip(axes, unsigned, strict=True) if found)
-        missing = missing_sign(run.current_a[:, unsigned])
-        raise CurrentUnsigned(run.name, names, missing)
+        found = np.flatnonzero(unsigned).tolist()
+        names = tuple(axes[axis] for axis in found)
+        raise CurrentUnsigned(run.name, names, missing_signs(run, found))
+
+
+def missing_signs(run: Run, axes: Sequence[int]) -> tuple[str, ...]:
+    """Return the sign that the current of each of these axes does not have, in words."""
+    signs: list[str] = []
+    for axis in axes:
+        used = _used_samples(run, axis)
+        signs.append(missing_sign(run.current_a[used, axis]))
+    return tuple(signs)
 
 
 def missing_sign(current: FloatArray) -> str:
-    """Return the sign that currents of one sign do not have, in words.
+    """Return the sign that a current of one sign does not have, in words.
 
     Args:
-        current: of one axis or of several, shape (k,) or (k, c). A value of the other sign may be
-            there, of rounding or of an offset (OTHER_SIGN_SHARE): the larger size decides.
+        current: shape (k,). A value of the other sign may be there, of rounding or of an offset
+            (OTHER_SIGN_SHARE): the larger size decides.
     """
     if current.max() > -current.min():
         return "negative"
@@ -155,7 +168,7 @@ def bounces(size: FloatArray, time_s: FloatArray) -> bool:
     """
     usual = float(np.percentile(size, USUAL_PERCENTILE))
     # A drive may report more slowly than the recorder samples: each value counts once, at its
-    # first sample.
+    # first sample. NaN differs from the first value.
     start = np.flatnonzero(np.diff(size, prepend=np.nan) != 0.0)
     end = np.append(start[1:], len(size)) - 1
     stays_too_long = time_s[end] - time_s[start] > LONGEST_VISIT_S
@@ -164,9 +177,9 @@ def bounces(size: FloatArray, time_s: FloatArray) -> bool:
     if len(near_zero) < LEAST_VISITS:
         return False
     values = np.unique(size)
-    count = float(np.diff(values).min())
+    smallest_step = float(np.diff(values).min())
     fewest_visits = LEAST_COARSE_VISITS
-    if count <= COARSE_COUNT_SHARE * usual:
+    if smallest_step <= COARSE_COUNT_SHARE * usual:
         fewest_visits = LEAST_VISITS
     visits = _visits(size, near_zero, time_s)
     if len(visits) < fewest_visits:
@@ -188,13 +201,14 @@ def _visits(size: FloatArray, near_zero: IntArray, time_s: FloatArray) -> IntArr
     pauses_s = np.diff(time_s[near_zero], prepend=-np.inf)
     first_of_visit = np.flatnonzero(pauses_s > LEAST_PAUSE_S)
     visits: list[int] = []
+    # The pause before the first visit is endless, so the first of these numbers is 0.
     for samples in np.split(near_zero, first_of_visit[1:]):
         nearest = int(np.argmin(size[samples]))
         visits.append(int(samples[nearest]))
     return np.array(visits)
 
 
-def rise_ratio(size: FloatArray, visits: IntArray, time_s: FloatArray, rise: float) -> float:
+def rise_ratio(size: FloatArray, visits: IntArray, time_s: FloatArray, least_rise: float) -> float:
     """Median rise of a current around its visits to zero over the time 2 t,
     relative to that over t.
 
@@ -202,23 +216,23 @@ def rise_ratio(size: FloatArray, visits: IntArray, time_s: FloatArray, rise: flo
         size: of the current, shape (k,).
         visits: number of the sample nearest to zero in each visit.
         time_s: of each sample, shape (k,).
-        rise: by which the current rises over t.
+        least_rise: the least rise over t.
 
     Returns:
-        the ratio for the shortest t; infinity where the current rises too slowly.
+        the ratio for the shortest t with this rise; infinity where the current rises too slowly.
     """
     # Samples that may not be used leave gaps: the first step may be one.
     sampling_period_s = np.median(np.diff(time_s))
     longest = max(round(LONGEST_RISE_S / sampling_period_s), 1)
-    lags = np.round(np.geomspace(1.0, longest, 40)).astype(int)
     # t is lag samples.
+    lags = np.round(np.geomspace(1.0, longest, LAGS)).astype(int)
     for lag in np.unique(lags).tolist():
         is_inside = (visits >= 2 * lag) & (visits < len(size) - 2 * lag)
         inside = visits[is_inside]
         if not len(inside):
             break
         rise_over_t = median_rise(size, inside, lag)
-        if rise_over_t >= rise:
+        if rise_over_t >= least_rise:
             rise_over_2t = median_rise(size, inside, 2 * lag)
             return rise_over_2t / rise_over_t
     return float("inf")

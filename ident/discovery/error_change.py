@@ -178,12 +178,12 @@ class ErrorChange:
     def harm(self, data: str) -> str:
         """Say which error on some data rises by more than noise; empty where none does."""
         if self.is_rise:
-            return f"the squared error on {data} rises by {_describe_rise(self.total)}"
+            return f"the squared error on {data} rises by {_describe_size(self.total)}"
         worse = self.worse_motors
         if not worse:
             return ""
         worst = max(worse, key=lambda motor: self.motors[motor].sigmas)
-        size = _describe_rise(self.motors[worst])
+        size = _describe_size(self.motors[worst])
         return f"the squared error of motor {worst + 1} on {data} rises by {size}"
 
 
@@ -198,9 +198,9 @@ def _rises_by_share(change: PairedChange, before: float, share: float) -> bool:
     return change.rise > largest_rise
 
 
-def _describe_rise(change: PairedChange) -> str:
-    """Rise of a squared error with its σ, in words."""
-    return f"{change.rise:.3g} ± {change.std:.2g} noise variances"
+def _describe_size(change: PairedChange) -> str:
+    """Size of a rise or fall of a squared error with its σ, in words."""
+    return f"{abs(change.rise):.3g} ± {change.std:.2g} noise variances"
 
 
 def describe_noise(change: PairedChange, data: str) -> str:
@@ -213,8 +213,7 @@ def describe_noise(change: PairedChange, data: str) -> str:
     verb = "rises"
     if change.rise < 0:
         verb = "falls"
-    size = f"{abs(change.rise):.3g} ± {change.std:.2g} noise variances"
-    return f"the squared error on {data} {verb} by {size}, which may be noise"
+    return f"the squared error on {data} {verb} by {_describe_size(change)}, which may be noise"
 
 
 def compare_by_block(change: FloatArray, move: IntArray, run: IntArray) -> PairedChange:
@@ -226,7 +225,8 @@ def compare_by_block(change: FloatArray, move: IntArray, run: IntArray) -> Paire
 
     Args:
         change: of each row, shape (r,).
-        move: number of each row's move, in the order of time, shape (r,).
+        move: number of each row's move, shape (r,). Later moves have larger numbers; the rows may
+            be in any order.
         run: of each row, shape (r,).
     """
     _, first, move_of_row = np.unique(move, return_index=True, return_inverse=True)
@@ -236,6 +236,7 @@ def compare_by_block(change: FloatArray, move: IntArray, run: IntArray) -> Paire
         centred = sums - sums.mean()
         are_of_one_run = runs[1:] == runs[:-1]
         products = (centred[1:] * centred[:-1])[are_of_one_run]
+        # Of the sum of the products, whose mean is zero without correlation
         standard_error = float(np.linalg.norm(products))
         if float(products.sum()) <= CORRELATED * standard_error:
             break

@@ -41,7 +41,7 @@ from ident.data.run_channels import (
     still_diagnoses,
 )
 from ident.data.unsigned_current import (
-    missing_sign,
+    missing_signs,
     one_sided_currents,
     refuse_unsigned,
     unsigned_currents,
@@ -661,13 +661,12 @@ def unsigned_channels(
         return None
     own_errors = np.diag(channel_errors(model, runs, conditioning))
     is_unexplained = 100.0 * own_errors > LARGEST_AXIS_ERROR_PERCENT
-    unsigned = np.flatnonzero(one_sided & is_unexplained)
-    if not len(unsigned):
+    unsigned = np.flatnonzero(one_sided & is_unexplained).tolist()
+    if not unsigned:
         return None
     run_names = ", ".join(run.name for run in runs)
-    axis_names = tuple(axes[axis] for axis in unsigned.tolist())
-    evidence = missing_sign(runs[0].current_a[:, unsigned])
-    return CurrentUnsigned(run_names, axis_names, evidence)
+    axis_names = tuple(axes[axis] for axis in unsigned)
+    return CurrentUnsigned(run_names, axis_names, missing_signs(runs[0], unsigned))
 
 
 def channel_errors(model: Model, runs: Iterable[Run], conditioning: Conditioning) -> FloatArray:

@@ -34,7 +34,7 @@ LINK_PARAMETERS = ("Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz", "mx", "my", "mz", "
 
 LINK_UNITS = ("kg m²",) * 6 + ("kg m",) * 3 + ("kg",)
 #: Largest negative eigenvalue that rounding in a drawing may give, as a share of the inertia's size
-ROUNDING = 1e-3
+DRAWING_ROUNDING = 1e-3
 _ROWS, _COLUMNS = np.triu_indices(3)
 
 
@@ -43,8 +43,9 @@ class Payload:
     """A weighed body as it was mounted; each mounting has its own unknowns.
 
     Raises:
-        ModelError: a name is not in LINK_PARAMETERS, a value is no finite number, the mass is not
-            above zero, or no body has such an inertia.
+        ModelError: an argument is of another type, a name is not in LINK_PARAMETERS, a value is no
+            finite number, the mass is not above zero, the tolerance is below zero, or no body has
+            such an inertia.
     """
 
     name: str  #: of the body
@@ -54,8 +55,8 @@ class Payload:
     #: carries it (paper eq. 5, χ_kL); the weighed mass alone is {"m": 4.59}.
     known: dict[str, float] = field(default_factory=dict)
     #: Tolerance of the weighed mass [kg], a standard deviation; 0 where none is declared.
-    #: `Calibration.payload_mass` has what it makes of each gain, and `weigh` has it in σ; σ of the
-    #: gains does not. A cell file has its own.
+    #: σ of the gains does not contain it: `Calibration.payload_mass` says how far it changes each
+    #: gain. σ of what `weigh` finds does.
     mass_tolerance_kg: float = 0.0
 
     def __post_init__(self) -> None:
@@ -158,19 +159,22 @@ def _require_possible_inertia(payload: Payload) -> None:
         return
     pseudo = pseudo_inertia(payload.known_parameters)
     second_moments = pseudo[:3, :3]
-    if set(known) != set(LINK_PARAMETERS):
-        pseudo = second_moments
-    size = max(float(np.trace(second_moments)), 0.0)
+    judged = second_moments
+    if set(known) == set(LINK_PARAMETERS):
+        judged = pseudo
+    # The sum of the eigenvalues' sizes: the trace for a body
+    size = float(np.linalg.norm(second_moments, "nuc"))
     # The rows of the second moments and of the mass have other units: compare them at a common
     # size.
-    scale = np.ones(len(pseudo))
+    scale = np.ones(len(judged))
     if size > 0.0:
         scale[:3] = np.sqrt(size)
-    scale[3:] = np.sqrt(known.get("m", 1.0))
-    scaled = pseudo / np.outer(scale, scale)
+    if judged is pseudo:
+        scale[3] = np.sqrt(known["m"])
+    scaled = judged / np.outer(scale, scale)
     eigenvalues = np.linalg.eigvalsh(scaled)
     smallest = float(eigenvalues[0])
-    if smallest >= -ROUNDING:
+    if smallest >= -DRAWING_ROUNDING:
         return
     values = [f"{name} = {known[name]:g}" for name in LINK_PARAMETERS if name in known]
     inertia = ", ".join(values)

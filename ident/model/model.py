@@ -253,7 +253,7 @@ class Model:
         return self._axis_columns + ROTOR_INERTIA
 
     @property
-    def _coupled_columns(self) -> IntArray:
+    def coupled_columns(self) -> IntArray:
         """First column of each motor that turns with several joints, shape (coupled,):
         Iam, then fvm and fsm.
         """
@@ -263,12 +263,12 @@ class Model:
 
     def _each_coupled(self) -> Iterable[tuple[int, int]]:
         """Each motor that turns with several joints, and its first column."""
-        return zip(self.drive_train.coupled, self._coupled_columns.tolist(), strict=True)
+        return zip(self.drive_train.coupled, self.coupled_columns.tolist(), strict=True)
 
     @property
     def coupled_dry_friction_columns(self) -> IntArray:
         """Column of fsm of each motor that turns with several joints, shape (coupled,)."""
-        return self._coupled_columns + 2
+        return self.coupled_columns + 2
 
     @property
     def friction_columns(self) -> IntArray:
@@ -276,7 +276,7 @@ class Model:
         several joints.
         """
         of_axes = self._axis_columns[:, None] + np.array([VISCOUS_FRICTION, DRY_FRICTION])
-        of_coupled = self._coupled_columns[:, None] + np.array([1, 2])
+        of_coupled = self.coupled_columns[:, None] + np.array([1, 2])
         return np.concatenate((of_axes.ravel(), of_coupled.ravel()))
 
     @property

@@ -9,8 +9,8 @@ joint is a pivot. With the angular velocities ω₁, ω₂ of the two links, its
 
 so that a torque τ_ψ in the pivot acts as J_ψᵀ τ_ψ on the joints of the tree (virtual power, as for
 a passive joint in Briot & Gautier, Multibody System Dynamics 2015). Either all revolute joints of
-the loop are parallel to a, or the closure holds the other two angles: ω₂ − ω₁ has the direction of
-a, and a · (ω₂ − ω₁) counts every revolute joint of the loop.
+the loop are parallel to a, or the closure holds the other two angles. So ω₂ − ω₁ has the direction
+of a, and a · (ω₂ − ω₁) is the sum over the revolute joints of the loop.
 
 A ball joint turns about three axes at once and has no such angle: it is no pivot here, and friction
 in it has no name.
@@ -28,11 +28,12 @@ from ident.model.closed_chain import Assembly, assemble, null_space, towards_clo
 from ident.model.closures import joint_axes, loops, spin
 from ident.model.robot import Closure, JointKind, Motion, Pivot, Poses, Robot, joints_to_base, poses
 
-#: Difference of two joints' speeds, relative to the largest, below which they turn alike
+#: Difference of two joints' speeds, relative to the largest, below which they turn alike; also the
+#: speed of a pivot, relative to the largest of a joint, below which it does not turn
 ALIKE_TOLERANCE = 1e-7
 PARALLEL_SINE = 1e-6  #: Sine of the angle between two axes that count as parallel
 DISTANCES_FROM_ASSEMBLY = (0.0, 0.06, -0.09)
-"""Distances of the poses at which speeds are compared from the assembly pose [rad or m]."""
+"""Speeds are compared at poses that are this far from the assembly pose [rad or m]."""
 
 
 def cut_pivots(robot: Robot) -> tuple[Pivot, ...]:
@@ -59,11 +60,14 @@ def cut_pivots(robot: Robot) -> tuple[Pivot, ...]:
         return ()
     speeds = _speeds_near(replace(robot, pivots=turning), assembly)
     count = robot.joint_count
-    known = [speeds[:, joint] for joint in range(count)]
+    of_joints = speeds[:, :count]
+    known = list(of_joints.T)
+    # Where the joints of a loop turn against each other, a pivot at rest has a rounding error.
+    least_speed = ALIKE_TOLERANCE * float(np.abs(of_joints).max())
     found: list[Pivot] = []
     for number, pivot in enumerate(turning):
         speed = speeds[:, count + number]
-        turns = float(np.abs(speed).max()) > 0.0
+        turns = float(np.abs(speed).max()) > least_speed
         is_known = any(_turn_alike(speed, other) for other in known)
         if turns and not is_known:
             found.append(pivot)
@@ -135,10 +139,10 @@ def pivot_motion(robot: Robot, assembly: Assembly, joints: Motion) -> Motion:
     axes = joint_axes(robot, placed)
     angular_velocity = spin(robot, placed, axes, joints.velocity_rad_s).angular
     for number, pivot in enumerate(robot.pivots):
-        middle = _angle(robot, assembled, pivot)
-        away = _angle(robot, placed, pivot) - middle
+        assembly_angle = _angle(robot, assembled, pivot)
+        away = _angle(robot, placed, pivot) - assembly_angle
         within_half_turn = np.arctan2(np.sin(away), np.cos(away))
-        position[:, number] = middle + within_half_turn
+        position[:, number] = assembly_angle + within_half_turn
         about = _axis(robot, placed, pivot)
         loop = _loop(robot, robot.closures[pivot.closure])
         for joint, sign in loop.items():
@@ -163,7 +167,8 @@ def _pivot_of(robot: Robot, index: int) -> Pivot | None:
             turns.append(axis)
     if len(turns) == 1:
         return Pivot(index, turns[0])
-    # A planar mechanism holds two translations alone: it turns about the third axis.
+    # A closure of a planar mechanism holds two translations and no angle: it turns about the third
+    # axis. Any other that leaves two or three angles free turns about several axes.
     if len(turns) < 3 or len(translates) != 1:
         return None
     pivot = Pivot(index, translates[0])

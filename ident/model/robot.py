@@ -16,6 +16,7 @@ from ident.arrays import (
     is_whole_number,
     require_entries,
     require_kind,
+    require_names,
     require_number,
 )
 from ident.errors import ModelError
@@ -40,7 +41,7 @@ class Joint:
     translation_m: FloatArray  #: its origin there, (3,)
     axis: FloatArray  #: unit vector of the motion in the joint frame, (3,)
     #: Distance from the lowest to the highest position that its description allows [rad or m]; None
-    #: where it has no limits. Positions in another unit go far beyond it.
+    #: where it has no limits. Recorded positions that go far beyond it are in another unit.
     travel: float | None = None
     #: Lowest position that its description allows [rad or m]; None where it has no limits.
     lowest: float | None = None
@@ -115,7 +116,7 @@ class Robot:
     """
 
     joints: tuple[Joint, ...]  #: depth first from the base
-    #: in the base frame, shape (3,); any mounting of the base is a direction of gravity
+    #: in the base frame, shape (3,): of a base on a wall or a ceiling, it points another way
     gravity_m_s2: FloatArray
     closures: tuple[Closure, ...] = ()  #: none of a serial robot
     #: joint that each axis drives, in the order of the axes; empty: every joint is driven
@@ -229,11 +230,15 @@ class Robot:
 
 
 def require_described(robot: Robot) -> None:
-    """Refuse a robot made by hand whose parts are not what they are declared to be.
+    """Refuse a robot made by hand of which a part is not of the type or shape that is declared,
+    or refers to one that the robot does not have.
+
+    Whether its loops close is found later (`ident.model.closed_chain.assemble`).
 
     Raises:
-        ModelError: a part is of another type or shape, no finite number, or names a joint that
-            the robot does not have.
+        ModelError: a part is of another type or shape, no finite number, or has the index of a
+            joint or closure that the robot does not have; a direction of a closure is none of
+            DIRECTIONS; or a joint follows a follower.
     """
     _require_parts("joints", robot.joints, Joint)
     if not robot.joints:
@@ -246,18 +251,65 @@ def require_described(robot: Robot) -> None:
     for motor in robot.motors:
         _require_index("an entry of motors", motor, count)
     for closure in _require_parts("closures", robot.closures, Closure):
+        require_kind("name of a closure", closure.name, str, "give a text that names it")
         _require_place(f"first of closure {closure.name!r}", closure.first, count)
         _require_place(f"second of closure {closure.name!r}", closure.second, count)
+        require_directions(closure.name, closure.directions)
     for coupling in _require_parts("couplings", robot.couplings, JointCoupling):
         _require_index("follower of a coupling", coupling.follower, count)
         _require_index("leader of a coupling", coupling.leader, count)
         require_number("multiplier of a coupling", coupling.multiplier)
         require_number("offset of a coupling", coupling.offset)
-    _require_parts("pivots", robot.pivots, Pivot)
+    _require_leaders(robot)
+    _require_pivots(robot)
     if robot.assembly_rad is not None:
         as_array("assembly_rad", robot.assembly_rad, (count,), "one position per joint")
     if robot.platform is not None:
         _require_place("platform", robot.platform, count)
+
+
+def require_directions(closure: str, directions: Sequence[str]) -> None:
+    """Refuse directions of a closure that are not some of DIRECTIONS, each once, as a `ModelError`.
+
+    Args:
+        closure: its name.
+        directions: in which its frames coincide.
+    """
+    source = f"closure {closure!r}"
+    require_names(f"directions of {source}", directions)
+    are_known = set(directions) <= set(DIRECTIONS)
+    are_distinct = len(set(directions)) == len(directions)
+    if not (directions and are_known and are_distinct):
+        given = ", ".join(directions) or "none"
+        known = ", ".join(DIRECTIONS)
+        raise ModelError(
+            f"{source} has the directions {given}; expected some of {known}, each once"
+        )
+
+
+def _require_leaders(robot: Robot) -> None:
+    """Refuse a joint that follows a follower, as a `ModelError`."""
+    followers = {coupling.follower for coupling in robot.couplings}
+    for coupling in robot.couplings:
+        if coupling.leader in followers:
+            follower = robot.joints[coupling.follower].name
+            leader = robot.joints[coupling.leader].name
+            raise ModelError(
+                f"joint {follower!r} follows {leader!r}, a follower itself; expected a leader that "
+                "follows none; give the joint at the head, and the product of the multipliers"
+            )
+
+
+def _require_pivots(robot: Robot) -> None:
+    """Refuse pivots of closures that the robot does not have, as a `ModelError`."""
+    _require_parts("pivots", robot.pivots, Pivot)
+    if robot.pivots and not robot.closures:
+        raise ModelError(
+            "the robot has a pivot and no closure; expected none; a pivot is where a loop is cut"
+        )
+    for pivot in robot.pivots:
+        _require_index("closure of a pivot", pivot.closure, len(robot.closures), of="a closure")
+        _require_index("axis of a pivot", pivot.axis, 3, of="an axis")
 
 
 Part = TypeVar("Part")
@@ -301,13 +353,16 @@ def _require_place(label: str, place: Place, count: int) -> None:
     as_array(f"translation_m of the {label}", place.translation_m, (3,), "in the joint's frame")
 
 
-def _require_index(label: str, index: object, end: int, *, least: int = 0) -> None:
+def _require_index(
+    label: str, index: object, end: int, *, least: int = 0, of: str = "a joint"
+) -> None:
     """Refuse an index that is not in [least, end), as a `ModelError`."""
-    if not is_whole_number(index) or not least <= index < end:
-        raise ModelError(
-            f"{label} is {index!r:.60}; expected a whole number from {least} to {end - 1}; "
-            "give the index of a joint"
-        )
+    if is_whole_number(index) and least <= index < end:
+        return
+    expected = f"a whole number from {least} to {end - 1}"
+    if end - least == 1:
+        expected = f"{least}"
+    raise ModelError(f"{label} is {index!r:.60}; expected {expected}; give the index of {of}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -324,7 +379,9 @@ class Motion:
     velocity_rad_s: FloatArray  #: q̇, per s
     acceleration_rad_s2: FloatArray  #: q̈, per s²
 
-    if TYPE_CHECKING:  # whatever becomes an array
+    if (
+        TYPE_CHECKING
+    ):  # `__post_init__` takes whatever becomes an array, so type checkers must, too.
 
         def __init__(
             self, position_rad: ArrayLike, velocity_rad_s: ArrayLike, acceleration_rad_s2: ArrayLike
@@ -402,15 +459,16 @@ def _rotations_in_parent(robot: Robot, position_rad: FloatArray) -> FloatArray:
     """
     joints = robot.joints
     axes = np.array([joint.axis for joint in joints])
-    fixed = np.array([joint.rotation for joint in joints])
+    at_zero = np.array([joint.rotation for joint in joints])  # R₀
     is_revolute = np.array([joint.kind is JointKind.REVOLUTE for joint in joints])
     outer = axes[:, :, None] * axes[:, None]
     crosses = np.array([skew(axis) for axis in axes])
     across = np.eye(3) - outer
     terms = np.stack((outer, across, crosses), axis=1)
-    terms_in_parent = fixed[:, None] @ terms
+    terms_in_parent = at_zero[:, None] @ terms
     angle = position_rad.T * is_revolute[:, None]
     factors = np.stack((np.ones_like(angle), np.cos(angle), np.sin(angle)), axis=2)
+    # (n, k, 3 terms) @ (n, 3 terms, 9) is (n, k, 9)
     rotations = factors @ terms_in_parent.reshape(-1, 3, 9)
     return np.asarray(rotations.reshape(*angle.shape, 3, 3))
 

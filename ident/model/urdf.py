@@ -31,7 +31,6 @@ from ident.errors import ModelError
 from ident.model.bodies import Body, steiner
 from ident.model.pivots import cut_pivots
 from ident.model.robot import (
-    DIRECTIONS,
     Closure,
     Joint,
     JointCoupling,
@@ -39,6 +38,7 @@ from ident.model.robot import (
     Place,
     Robot,
     poses,
+    require_directions,
 )
 
 SAME_POSITION = 1e-3  #: Largest difference of two statements of one position [rad or m]
@@ -211,15 +211,7 @@ def _closure(found: UrdfRobot, pair: LinkPair) -> Closure:
     source = f"closure {pair.name!r}"
     require_kind(f"first link of {source}", pair.first, str, WRITE_CLOSURE)
     require_kind(f"second link of {source}", pair.second, str, WRITE_CLOSURE)
-    require_names(f"directions of {source}", pair.directions)
-    are_known = set(pair.directions) <= set(DIRECTIONS)
-    are_distinct = len(set(pair.directions)) == len(pair.directions)
-    if not (pair.directions and are_known and are_distinct):
-        given = ", ".join(pair.directions) or "none"
-        known = ", ".join(DIRECTIONS)
-        raise ModelError(
-            f"{source} has the directions {given}; expected some of {known}, each once"
-        )
+    require_directions(pair.name, pair.directions)
     first = _place_of(found, pair.first, source)
     second = _place_of(found, pair.second, source)
     return Closure(name=pair.name, first=first, second=second, directions=tuple(pair.directions))

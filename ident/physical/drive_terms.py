@@ -1,17 +1,18 @@
 """Rotors and friction as inertias, dampers and dry friction of single joints and of motors.
 
 The standard parameters of a motor that turns with several joints are split so that a fit sees them
-(paper eq. 25): with r the motor's direction, Iam and fvm are the off-diagonal part of r rᵀ, and the
-diagonal is in Ia and fv of the joints. Simulators have it the other way round: a rotor t acts on
-the joints as t r rᵀ, with its diagonal, and a joint has an inertia too. With t of each coupled
-motor m and a of each joint,
+(paper eq. 25): with r the motor's direction, Iam and fvm multiply the off-diagonal part of r rᵀ,
+and the diagonal is in Ia and fv of the joints. Simulators have it the other way round: a rotor t
+acts on the joints as t r rᵀ, with its diagonal, and a joint has an inertia too. With t of each
+coupled motor m and a of each joint,
 
     diag(Ia) + Σ_m Iam_m (r_m r_mᵀ − diag(r_m²)) = diag(a) + Σ_m t_m r_m r_mᵀ,
     t_m = Iam_m,    a = Ia − Σ_m Iam_m r_m²,
 
 and the same with fv and fvm. No simulator has a negative a or t. Where identified values would need
-one, t_m is as large as a ≥ 0 allows, the diagonal is still right, and the rest of Iam_m is named as
-left out. Dry friction is not split: fs is that of the joints, fsm that of the motors.
+one, the motors of that joint are reduced in one proportion until a ≥ 0. The diagonal is still
+right, and the rest of Iam_m is named as left out. Another division may leave out less. Dry friction
+is not split: fs is that of the joints, fsm that of the motors.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from scipy.optimize import nnls
 
 from ident.arrays import FloatArray
 from ident.model.bodies import LOADED
-from ident.model.model import COUPLED_COLUMNS, JOINT_COLUMNS, Model
+from ident.model.model import COUPLED_COLUMNS, Model
 
 ROUNDING = 1e-12  #: Share of a parameter up to which what is left of it is rounding error
 
@@ -73,33 +74,33 @@ def drive_terms(model: Model, standard: FloatArray) -> DriveTerms:
         standard: χ_st without payload, shape (c,).
     """
     coupled = list(model.drive_train.coupled)
-    first = JOINT_COLUMNS * model.robot.joint_count
-    end = first + COUPLED_COLUMNS * len(coupled)
-    of_coupled = slice(first, end)
-    # Iam, fvm and fsm of each motor
+    # Columns of Iam, fvm and fsm of each coupled motor
+    of_coupled = model.coupled_columns[:, None] + np.arange(COUPLED_COLUMNS)
     of_motors = np.zeros((model.robot.axis_count, COUPLED_COLUMNS))
-    of_motors[coupled] = standard[of_coupled].reshape(-1, COUPLED_COLUMNS)
+    of_motors[coupled] = standard[of_coupled]
     rotors = standard[model.rotor_columns]
     viscous = standard[model.viscous_friction_columns]
     dry = standard[model.dry_friction_columns]
     directions = model.drive_train.direction
     squares = directions**2
+    # Values that simulators can have stay as they were identified.
     for column, of_joints in ((INERTIA, rotors), (VISCOUS, viscous)):
         values = of_motors[:, column]
         is_negative = values < 0.0
         exceeds_joints = values @ squares > of_joints
         if np.any(is_negative) or np.any(exceeds_joints):
-            of_motors[coupled, column] = _least_of_motors(values[coupled], directions[coupled])
+            of_motors[coupled, column] = _not_negative(values[coupled], directions[coupled])
     inertia = _split(rotors, of_motors[:, INERTIA], squares)
     damping = _split(viscous, of_motors[:, VISCOUS], squares)
     dry_friction = Terms(
         of_axes=np.maximum(dry, 0.0),
         of_motors=np.maximum(of_motors[:, DRY], 0.0),
     )
-    # The least parameters of the coupled motors give the same torque as the identified ones.
-    wanted = standard.copy()
-    wanted[of_coupled] = of_motors[coupled].ravel()
-    missing = wanted - _standard_of(model, inertia, damping, dry_friction)
+    # Other parameters of the coupled motors give the same torque as the identified ones
+    # (`_not_negative`), so what is missing is judged by them.
+    same_torque = standard.copy()
+    same_torque[of_coupled] = of_motors[coupled]
+    missing = same_torque - _standard_of(model, inertia, damping, dry_friction)
     missing[model.link_columns] = 0.0
     left_over: list[LeftOver] = []
     for parameter, value, identified in zip(model.columns, missing, standard, strict=True):
@@ -111,15 +112,16 @@ def drive_terms(model: Model, standard: FloatArray) -> DriveTerms:
     return DriveTerms(inertia, damping, dry_friction, tuple(left_over))
 
 
-def _least_of_motors(of_motors: FloatArray, directions: FloatArray) -> FloatArray:
-    """Return the least Iam or fvm that couple the joints as the identified ones do, shape (c,).
+def _not_negative(of_motors: FloatArray, directions: FloatArray) -> FloatArray:
+    """Return Iam or fvm that are not negative and couple the joints as the identified ones do,
+    shape (c,); the identified ones where there are no such values.
 
-    None of them is negative; where that is impossible, the identified ones are returned. Both
-    motors of a differential couple its joints with opposite signs: the torque shows their
-    difference only, and what both have in common would be taken from the joints.
+    Both motors of a differential couple its joints with opposite signs: the torque shows their
+    difference only, and what both have in common would be taken from the joints. Of these two, one
+    becomes zero.
 
     Args:
-        of_motors: Iam or fvm of the motors that turn with several joints, shape (c,).
+        of_motors: Iam or fvm of the c motors that turn with several joints, shape (c,).
         directions: r of each of them, shape (c, m).
     """
     first, second = np.triu_indices(directions.shape[1], 1)
@@ -127,9 +129,9 @@ def _least_of_motors(of_motors: FloatArray, directions: FloatArray) -> FloatArra
     # Off-diagonal element of r rᵀ for each pair of joints (row) and motor (column)
     couplings = products.T
     wanted = couplings @ of_motors
-    least, residual = nnls(couplings, wanted)
+    not_negative, residual = nnls(couplings, wanted)
     if residual <= ROUNDING * np.linalg.norm(wanted):
-        return np.asarray(least)
+        return np.asarray(not_negative)
     return of_motors
 
 
@@ -144,7 +146,8 @@ def _split(of_joints: FloatArray, of_motors: FloatArray, squares: FloatArray) ->
     diagonal = np.maximum(of_joints, 0.0)
     wanted = np.maximum(of_motors, 0.0)
     diagonal_of_motors = wanted @ squares
-    # Where the motors would exceed the diagonal of a joint, each of them gets a share only.
+    # Where the motors would exceed the diagonal of a joint, each of them gets the same share only.
+    # A motor of several joints gets the least of its shares.
     allowed_share = np.ones(len(diagonal))
     exceeds = diagonal_of_motors > diagonal
     allowed_share[exceeds] = diagonal[exceeds] / diagonal_of_motors[exceeds]
@@ -161,10 +164,9 @@ def _standard_of(model: Model, inertia: Terms, damping: Terms, dry_friction: Ter
     standard[model.rotor_columns] = inertia.of_axes + inertia.of_motors @ squares
     standard[model.viscous_friction_columns] = damping.of_axes + damping.of_motors @ squares
     standard[model.dry_friction_columns] = dry_friction.of_axes
-    first = JOINT_COLUMNS * model.robot.joint_count
-    for motor in model.drive_train.coupled:
+    of_coupled = zip(model.coupled_columns.tolist(), model.drive_train.coupled, strict=True)
+    for first, motor in of_coupled:
         standard[first + INERTIA] = inertia.of_motors[motor]
         standard[first + VISCOUS] = damping.of_motors[motor]
         standard[first + DRY] = dry_friction.of_motors[motor]
-        first += COUPLED_COLUMNS
     return standard

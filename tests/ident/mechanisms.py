@@ -174,6 +174,45 @@ def _five_bar() -> Mechanism:
     )
 
 
+def pin_on_a_parallel_link() -> Mechanism:
+    """A parallelogram, and a pin on the link that stays parallel to its base, which pushes two
+    slides: the pin does not turn in them.
+    """
+    base_m = 0.5
+    angle = 0.7
+    pin_m = np.array([0.23, 0.11])
+    urdf = _Urdf("pin-on-a-parallel-link")
+    crank = urdf.hinge("crank", "base", place(0.0))
+    link = urdf.hinge("link", crank, place(CRANK_M))
+    follower = urdf.hinge("follower", "base", place(base_m))
+    urdf.frame("link-end", link, place(base_m))
+    urdf.frame("follower-end", follower, place(CRANK_M))
+    urdf.frame("pin", link, place(pin_m[0], pin_m[1]))
+    across = urdf.joint("across", "prismatic", "base", place(0.0), "1 0 0")
+    urdf.joint("along", "prismatic", across, place(0.0), "0 1 0")
+    at_pin_m = CRANK_M * np.array([np.cos(angle), np.sin(angle)]) + pin_m
+    assembly_rad = {
+        "crank": angle,
+        "link": -angle,
+        "follower": angle,
+        "across": float(at_pin_m[0]),
+        "along": float(at_pin_m[1]),
+    }
+    return Mechanism(
+        name="pin-on-a-parallel-link",
+        urdf=urdf.text,
+        motors=("crank",),
+        closures=(
+            LinkPair("parallelogram", "link-end", "follower-end", PLANE),
+            LinkPair("slot", "pin", "along", PLANE),
+        ),
+        platform="along",
+        mobility=1,
+        gains=np.array([20.0]),
+        assembly_rad=assembly_rad,
+    )
+
+
 LEG_M = 0.28
 LEFT_FRONT = (-0.35, -0.1, -1.0)
 LEFT_BACK = (-0.35, 0.1, 1.0)

@@ -275,6 +275,34 @@ def test_a_glitch_of_held_readings_is_a_reading() -> None:
     assert found.stretches.tolist() == [[1500, 1510]]
 
 
+def slowly_reported(channel: FloatArray) -> FloatArray:
+    """The channel with each fourth reading held for 4 ms."""
+    return channel[np.arange(SAMPLES) // 4 * 4]
+
+
+@pytest.mark.parametrize("size_a", [2.0, -2.0])
+def test_a_small_peak_of_a_slowly_reported_current_is_no_fault(size_a: float) -> None:
+    """A controller may ask for it where a joint breaks loose."""
+
+    def change(channel: FloatArray) -> None:
+        channel[:] = slowly_reported(channel)
+        channel[1500:1504] += size_a
+
+    position, current = damaged_current(change)
+    assert find_faults(position, current, RATE_HZ) == ()
+
+
+def test_a_dropout_of_a_slowly_reported_current_is_found() -> None:
+    def change(channel: FloatArray) -> None:
+        channel[:] = slowly_reported(channel)
+        channel[1500:1520] = channel[1500] + 2.0
+
+    position, current = damaged_current(change)
+    (found,) = find_faults(position, current, RATE_HZ)
+    assert place_of(found) == (FaultKind.GLITCH, ChannelKind.CURRENT, 1)
+    assert found.stretches.tolist() == [[1500, 1520]]
+
+
 def joints_of_coupled_motors(motor_rad: FloatArray) -> FloatArray:
     return np.asarray(motor_rad @ np.linalg.inv(COUPLED).T)
 
@@ -308,6 +336,19 @@ def test_frozen_encoders_of_two_joints_of_a_differential_are_both_found() -> Non
         (FaultKind.FROZEN, 0),
         (FaultKind.FROZEN, 1),
     ]
+
+
+@pytest.mark.parametrize("joint", [0, 1])
+def test_a_frozen_encoder_of_a_joint_of_a_differential_costs_no_reading_of_the_other(
+    joint: int,
+) -> None:
+    motor_rad, current = sound()
+    joint_rad = np.linalg.solve(DIFFERENTIAL, motor_rad.T).T
+    joint_rad[1500:1800, joint] = joint_rad[1500, joint]
+    faults = find_faults(joint_rad, current, RATE_HZ, DIFFERENTIAL)
+    filled = mended(joint_rad, faults, RATE_HZ, DIFFERENTIAL)
+    is_filled = np.any(filled != joint_rad, axis=0)
+    assert np.flatnonzero(is_filled).tolist() == [joint]
 
 
 def test_what_is_known_to_be_missing_is_no_finding() -> None:

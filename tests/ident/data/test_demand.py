@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -111,6 +112,23 @@ def test_an_axis_that_rests_is_demanded_to_rest() -> None:
     found = demanded_positions(dataset(motion), STRAIGHT)
     assert found is not None
     assert found[:, 1] == pytest.approx(0.7)
+
+
+def test_a_motion_of_one_sample_at_the_end_is_a_move() -> None:
+    # Only the largest speed of a rest finds the rests below this disturbance. At 20 Hz, the last
+    # rest has two samples, and the motor moves off in the last sample.
+    disturbance = 0.012 * np.sin(2.0 * np.pi * np.arange(20) / 5.0)
+    move = np.array([0.1, 0.3, 0.5, 0.7, 0.9])
+    end = [0.0, 0.0, 0.0, 0.03]
+    motor = np.concatenate((disturbance, move, 1.0 + disturbance[:10], move[::-1], end))
+    position = np.column_stack((motor, motor))
+    longer = np.concatenate((position[:1], position, position[-1:]))
+    run = Run("run", np.arange(len(longer)) / 20.0, longer, np.zeros_like(longer))
+    slow = replace(CONDITIONING, position_cutoff_hz=5.0, decimation_cutoff_hz=2.0)
+    data = replace(differentiate(run, STRAIGHT, slow), position_rad=position)
+    found = demanded_positions(data, STRAIGHT)
+    assert found is not None
+    assert np.max(np.abs(found - position)) < 0.05
 
 
 def test_derivatives_are_those_of_the_demanded_positions() -> None:

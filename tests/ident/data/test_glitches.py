@@ -145,6 +145,14 @@ def test_up_to_three_readings_at_an_end_of_a_position_are_a_glitch(
     assert found.step.tolist() == []
 
 
+def test_a_glitch_at_the_beginning_is_alone_where_the_next_is_more_than_50_ms_away() -> None:
+    values = np.zeros(SAMPLES)
+    values[:2] = 4.0
+    values[30] = 4.0
+    glitches = _position_jumps(values, every=10).glitches
+    assert [(one.first, one.end) for one in glitches] == [(0, 2), (30, 31)]
+
+
 @pytest.mark.parametrize("place", [slice(0, 4), slice(SAMPLES - 4, SAMPLES)])
 def test_four_readings_at_an_end_are_another_place(place: slice) -> None:
     values = np.zeros(SAMPLES)
@@ -161,8 +169,8 @@ def _current() -> FloatArray:
     return np.asarray(_sine() + np.random.default_rng(1).normal(scale=0.01, size=SAMPLES))
 
 
-def _current_glitches(values: FloatArray) -> list[tuple[int, int]]:
-    found = find_jumps(_readings(values), is_position=False)
+def _current_glitches(values: FloatArray, every: int = 1) -> list[tuple[int, int]]:
+    found = find_jumps(_readings(values, every), is_position=False)
     return [(one.first, one.end) for one in found.glitches]
 
 
@@ -189,6 +197,36 @@ def test_a_current_need_not_return_at_an_end(place: slice) -> None:
     values = _current()
     values[place] += 9.0
     assert _current_glitches(values) == []
+
+
+@pytest.mark.parametrize("every", [1, 4, 20])
+@pytest.mark.parametrize(
+    ("added", "is_glitch"),
+    [([1.5], False), ([1.5, 1.6], False), ([2.5], True), ([2.5, 2.7, 2.6], True)],
+)
+def test_a_short_glitch_is_of_three_readings_however_long_each_of_them_stays(
+    added: list[float], is_glitch: bool, every: int
+) -> None:
+    # The usual range of this current is 2.
+    values = _current()
+    end = 500 + len(added)
+    values[500:end] += added
+    expected = [(500, end)] if is_glitch else []
+    assert _current_glitches(values, every) == expected
+
+
+@pytest.mark.parametrize(("stays", "is_glitch"), [(12, False), (13, True), (50, True)])
+def test_a_number_that_stays_as_long_as_several_readings_is_a_dropout(
+    stays: int, is_glitch: bool
+) -> None:
+    # Every reading stays for 4 samples, and the one of zero for longer.
+    values = _current()
+    values[250] = 0.0
+    sample = 4 * np.arange(SAMPLES)
+    sample[251:] += stays - 4
+    readings = Readings(values=values, sample=sample, rate_hz=RATE_HZ, count=COUNT)
+    glitches = find_jumps(readings, is_position=False).glitches
+    assert bool(glitches) is is_glitch
 
 
 # Counters that wrap
@@ -254,6 +292,13 @@ def test_a_channel_without_steps_has_no_range() -> None:
 def test_a_current_that_friction_turns_between_two_values_is_no_counter() -> None:
     square = np.where(np.arange(SAMPLES) // 100 % 2 == 0, 1.0, -1.0)
     assert _range(square, is_position=False) is None
+
+
+@pytest.mark.parametrize("samples", [102, 202])
+def test_a_current_that_wraps_at_its_first_and_its_last_step_is_a_counter(samples: int) -> None:
+    # From 0.995 to 0.005 at the first step, and after each hundred to the last one
+    values = np.mod(0.995 + 0.01 * np.arange(samples), 1.0)
+    assert _range(values, is_position=False) == pytest.approx(1.0)
 
 
 # Signs that were lost

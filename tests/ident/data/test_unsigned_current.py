@@ -12,7 +12,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ident.data.run import Run
-from ident.data.unsigned_current import bounces, missing_sign, unsigned_currents
+from ident.data.unsigned_current import (
+    bounces,
+    missing_sign,
+    require_signed_currents,
+    unsigned_currents,
+)
 from ident.errors import CurrentUnsigned
 from ident.estimators.identify import identify
 from tests.ident.mistaken import AXES, SMALL, small_recordings
@@ -50,6 +55,26 @@ def test_sizes_are_refused_and_the_axes_named(
         CurrentUnsigned, match=f"axis {names}: found currents that are never {other} .* both ways"
     ):
         identify(small_truth.model, [sized(run, axes, sign) for run in runs], SMALL, axes=AXES)
+
+
+def test_the_missing_sign_is_that_of_each_axis(small_truth: Truth, runs: list[Run]) -> None:
+    run = sized(sized(runs[0], [0, 2]), [1], -1.0)
+    found = (
+        rf"axis {', '.join(AXES)}: found currents that are never negative \({AXES[0]}, {AXES[2]}\) "
+    )
+    with pytest.raises(CurrentUnsigned, match=rf"{found}or never positive \({AXES[1]}\) while"):
+        require_signed_currents(run, small_truth.model.drive_train.ratio, AXES)
+
+
+def test_samples_that_are_no_use_have_no_sign(small_truth: Truth, runs: list[Run]) -> None:
+    run = sized(runs[0], [1])
+    valid = np.ones(run.current_a.shape, dtype=np.bool_)
+    valid[100:110] = False
+    current = run.current_a.copy()
+    current[100:110] = -50.0
+    found = replace(run, current_a=current, valid=valid)
+    with pytest.raises(CurrentUnsigned, match="never negative"):
+        require_signed_currents(found, small_truth.model.drive_train.ratio, AXES)
 
 
 def test_sizes_in_a_held_out_run_are_refused(small_truth: Truth, runs: list[Run]) -> None:

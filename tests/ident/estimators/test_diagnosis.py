@@ -571,6 +571,16 @@ def test_the_axis_whose_friction_jumps_through_zero_is_found_by_its_equation(
     assert unsigned_channels(model, [lifting], SMALL, AXES) is None
 
 
+def test_the_missing_sign_of_each_axis_is_named_by_its_equation(small_truth: Truth) -> None:
+    (run,) = small_recordings(small_truth, 3, count=1, noise_a=0.0)
+    sign = np.array([1.0, 1.0, -1.0])
+    sized = replace(run, current_a=sign * np.abs(run.current_a))
+    found = unsigned_channels(small_truth.model, [sized], SMALL, AXES)
+    assert found is not None
+    expected = f"never negative ({AXES[0]}, {AXES[1]}) or never positive ({AXES[2]})"
+    assert expected in found.found
+
+
 def _pendulum_run() -> Run:
     """An arm that hangs, is lifted and let down again, with hardly any friction:
     its current has one sign, almost.

@@ -37,6 +37,21 @@ IMPOSSIBLE: list[tuple[str, dict[str, Any], str]] = [
         {"m": 1.0, **MOMENTS, "Izz": 0.05},
         "has an inertia that no body has: .*Izz = 0.05.*expec",
     ),
+    (
+        "small negative moments",
+        {"m": 0.1, **MOMENTS, "Ixx": -1e-4, "Iyy": -1e-4, "Izz": -1e-4},
+        "has an inertia that no body has: .*Ixx = -0.0001",
+    ),
+    (
+        "small moments with the sum zero",
+        {"m": 0.1, **MOMENTS, "Ixx": 1e-4, "Iyy": -1e-4, "Izz": 0.0},
+        "has an inertia that no body has: .*Iyy = -0.0001",
+    ),
+    (
+        "products of inertia alone",
+        {"m": 0.1, **MOMENTS, "Ixx": 0.0, "Iyy": 0.0, "Izz": 0.0, "Ixy": 1e-4},
+        "has an inertia that no body has: .*Ixy = 0.0001",
+    ),
     ("not positive", {"m": 1.0, **MOMENTS, "Ixy": 0.03}, "has an inertia that no body has"),
     (
         "about the centre of mass",
@@ -59,6 +74,7 @@ def test_a_point_mass_and_a_rounded_drawing_are_bodies() -> None:
     inertia_kg_m2 = np.zeros((3, 3))
     point = Body(2.0, centre_m, inertia_kg_m2).parameters
     ident.Payload("point", "flange", dict(zip(LINK_PARAMETERS, point.tolist(), strict=True)))
+    ident.Payload("point at the origin", "flange", {"m": 2.0, **dict.fromkeys(MOMENTS, 0.0)})
     plate = {"Ixx": 0.0500, "Ixy": 0.0, "Ixz": 0.0, "Iyy": 0.0500, "Iyz": 0.0, "Izz": 0.1001}
     ident.Payload("plate", "flange", {"m": 4.0, **plate})
 

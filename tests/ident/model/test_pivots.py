@@ -15,6 +15,7 @@ from daq.config.cell_file import load_cell
 from daq.environment import shipped_configurations
 from ident.model.model import Model
 from ident.model.robot import Motion
+from tests.ident.mechanisms import pin_on_a_parallel_link
 
 STEP_S = 1e-4
 
@@ -88,3 +89,7 @@ def test_pivots_of_a_parallelogram_turn_as_joints_of_the_tree_and_are_no_places_
     None
 ):
     assert _model("orthoglide").robot.pivots == ()
+
+
+def test_a_pivot_that_does_not_turn_is_no_place() -> None:
+    assert pin_on_a_parallel_link().robot.pivots == ()

@@ -4,7 +4,9 @@ and that it is read as Pinocchio reads it.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -14,9 +16,16 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from ident.errors import ModelError
-from ident.model.robot import JointKind
+from ident.model.robot import (
+    JointCoupling,
+    JointKind,
+    Pivot,
+    Robot,
+    require_described,
+)
 from ident.model.urdf import UrdfRobot, hold_joints, read_urdf, robot_from_urdf
 from tests.ident.arms import CONFIGS, GANTRY, SEVEN_AXES, THREE_AXES
+from tests.ident.mechanisms import FIVE_BAR
 
 FloatArray = NDArray[np.float64]
 
@@ -527,3 +536,88 @@ def test_the_arms_of_the_tests_can_be() -> None:
     assert robot_from_urdf(SEVEN_AXES.urdf).joint_count == 7
     for arm in (SEVEN_AXES, GANTRY, THREE_AXES):
         _assert_read_as_pinocchio_reads(arm.urdf)
+
+
+# Robots made by hand
+
+
+def _with_closure(**changed: Any) -> Robot:
+    robot = FIVE_BAR.robot
+    (closure,) = robot.closures
+    return replace(robot, closures=(replace(closure, **changed),))
+
+
+def _with_couplings(*pairs: tuple[int, int]) -> Robot:
+    """Followers and their leaders."""
+    couplings = [JointCoupling(follower, leader, 1.0, 0.0) for follower, leader in pairs]
+    return replace(FIVE_BAR.robot, couplings=tuple(couplings))
+
+
+def _with_pivot(closure: int, axis: int) -> Robot:
+    return replace(FIVE_BAR.robot, pivots=(Pivot(closure, axis),))
+
+
+def _with_first_parent(parent: int) -> Robot:
+    robot = FIVE_BAR.robot
+    first, *others = robot.joints
+    return replace(robot, joints=(replace(first, parent=parent), *others))
+
+
+DIRECTIONS_WANTED = "expected some of x, y, z, rx, ry, rz, each once"
+INDESCRIBABLE: dict[str, tuple[Robot, str]] = {
+    "unknown direction": (
+        _with_closure(directions=("x", "up")),
+        f"closure 'tip' has the directions x, up; {DIRECTIONS_WANTED}",
+    ),
+    "direction twice": (
+        _with_closure(directions=("x", "x")),
+        f"closure 'tip' has the directions x, x; {DIRECTIONS_WANTED}",
+    ),
+    "no direction": (
+        _with_closure(directions=()),
+        f"closure 'tip' has the directions none; {DIRECTIONS_WANTED}",
+    ),
+    "directions in one text": (
+        _with_closure(directions="xy"),
+        "directions of closure 'tip' is the text 'xy'; expected a list of names",
+    ),
+    "a closure without a name": (
+        _with_closure(name=3),
+        "name of a closure is of type int; expected str",
+    ),
+    "the pivot of another closure": (
+        _with_pivot(1, 2),
+        "closure of a pivot is 1; expected 0; give the index of a closure",
+    ),
+    "a pivot of no closure": (
+        replace(_with_pivot(0, 2), closures=()),
+        "the robot has a pivot and no closure; expected none; a pivot is where a loop is cut",
+    ),
+    "the fourth axis": (
+        _with_pivot(0, 3),
+        "axis of a pivot is 3; expected a whole number from 0 to 2; give the index of an axis",
+    ),
+    "a leader that follows": (
+        _with_couplings((1, 0), (2, 1)),
+        "joint 'right-crank' follows 'left-rod', a follower itself; expected a leader",
+    ),
+    "a joint that follows itself": (
+        _with_couplings((1, 1)),
+        "joint 'left-rod' follows 'left-rod', a follower itself; expected a leader",
+    ),
+    "a first joint behind another": (
+        _with_first_parent(0),
+        "parent of joint 'left-crank' is 0; expected -1; give the index of a joint",
+    ),
+}
+
+
+@pytest.mark.parametrize(("robot", "words"), INDESCRIBABLE.values(), ids=INDESCRIBABLE)
+def test_a_robot_made_by_hand_is_refused_in_words(robot: Robot, words: str) -> None:
+    with pytest.raises(ModelError, match=words):
+        require_described(robot)
+
+
+def test_a_robot_with_pivots_and_followers_is_described() -> None:
+    require_described(FIVE_BAR.robot)
+    require_described(_with_couplings((1, 0), (3, 2)))
