@@ -12,7 +12,7 @@ import numpy as np
 
 from daq.config.cell import Cell, WeighedPayload, model_of
 from daq.config.workspace import DEFAULT_MINIMUM_M, Clearance
-from daq.errors import ConfigurationInconsistent
+from daq.errors import ConfigurationInconsistent, counted
 from drivers.move import Trapezoid, synchronised
 from ident.arrays import BoolArray, FloatArray
 from ident.model.robot import JointKind, Motion, Poses, Robot, poses
@@ -55,7 +55,7 @@ LINK_RADIUS_SHARE = 0.08
 6 cm for an arm of the TX-40's size.
 """
 POSTURES = 400  #: Random postures in which capsules are compared
-PAYLOAD = "payload"  #: Name of the capsule of a body that no capsule declares
+PAYLOAD = "payload"  #: Name of the guessed capsule of the payload
 LEAST_APART_SHARE = 0.03
 """Two capsules that are apart in no larger share of random postures are not checked against each
 other: they touch in nearly every posture, as at a shared joint.
@@ -67,9 +67,17 @@ class CheckedScene:
     """A scene, and what an operator must know of it."""
 
     checker: Checker  #: answers whether a way is clear
-    guessed: bool  #: the arm's shape is a guess
+    #: Number of declared capsules, which are the first of the scene; the others are guessed.
+    declared: int
+    #: Link on which a capsule of the payload would have to be declared; None where one is.
+    payload_link: str | None
     #: Names of pairs that are not checked, because they touch in nearly every posture.
     together: tuple[tuple[str, str], ...]
+
+    @property
+    def guessed(self) -> bool:
+        """Whether the arm's shape is a guess."""
+        return self.declared == 0
 
     @property
     def remarks(self) -> tuple[str, ...]:
@@ -77,7 +85,8 @@ class CheckedScene:
         scene = self.checker.scene
         count = len(scene.capsules)
         if not self.guessed:
-            shape = f"shape of the arm: {count} capsules, as declared"
+            capsules = counted(self.declared, "capsule")
+            shape = f"shape of the arm: {capsules}, as declared"
         elif self.checker.robot.is_constrained:
             shape = (
                 "shape of the links: unknown, of a closed chain it is not guessed; declare "
@@ -88,7 +97,13 @@ class CheckedScene:
                 f"shape of the arm: {count} capsules, guessed from the joint chain; declare "
                 "`clearance` in the cell file"
             )
-        lines = [shape, f"clearance: {1000 * scene.minimum_m:.0f} mm"]
+        lines = [shape]
+        if not self.guessed and self.payload_link is not None:
+            lines.append(
+                "shape of the payload: guessed from its mass; declare a capsule on link "
+                f"{self.payload_link} in `clearance.capsules` of the cell file"
+            )
+        lines.append(f"clearance: {1000 * scene.minimum_m:.0f} mm")
         if self.together:
             pairs = [f"{first} and {second}" for first, second in self.together]
             listed = ", ".join(pairs)
@@ -112,9 +127,12 @@ def scene_of(cell: Cell, robot: Robot, mass_kg: float) -> CheckedScene:
         mass_kg: of the payload, which gives the size of its capsule where none is declared.
     """
     declared = cell.clearance or Clearance(None, DEFAULT_MINIMUM_M, (), ())
+    declared_count = len(declared.capsules)
     capsules = declared.capsules or guessed_capsules(robot)
     carrier = robot.carrier
+    payload_link = None
     if not any(capsule.link == carrier for capsule in capsules):
+        payload_link = _link_name(cell, robot, carrier)
         # Around a steel cube of that mass: from the mounting to three of its sides away, with the
         # round ends.
         side_m = side_of_cube(mass_kg)
@@ -139,9 +157,9 @@ def scene_of(cell: Cell, robot: Robot, mass_kg: float) -> CheckedScene:
     # Two guessed capsules that never keep the least distance are as little worth checking as two
     # that always touch: each grows by half of that distance.
     grown = []
-    for capsule in capsules:
+    for number, capsule in enumerate(capsules):
         radius_m = capsule.radius_m
-        is_guessed = not declared.capsules or capsule.name == PAYLOAD
+        is_guessed = number >= declared_count
         if is_guessed:
             radius_m += 0.5 * declared.minimum_m
         grown.append(replace(capsule, radius_m=radius_m))
@@ -158,9 +176,18 @@ def scene_of(cell: Cell, robot: Robot, mass_kg: float) -> CheckedScene:
     scene = replace(scene_of_all_pairs, pairs=tuple(pairs))
     return CheckedScene(
         checker=Checker(robot, scene),
-        guessed=not declared.capsules,
+        declared=declared_count,
+        payload_link=payload_link,
         together=tuple(together),
     )
+
+
+def _link_name(cell: Cell, robot: Robot, joint: int) -> str:
+    """Return the name that a cell file has for the link behind a joint: that of the axis which
+    drives it, or of the joint where none does.
+    """
+    axis_by_joint = dict(zip(robot.axis_joints, cell.axis_names, strict=True))
+    return axis_by_joint.get(joint, robot.joints[joint].name)
 
 
 def _pairs_of_separate_links(
