@@ -573,8 +573,8 @@ def extra_moves(experiment: Experiment) -> tuple[ExtraMoves, ...]:
     of everything; the same every time.
 
     For every axis: fast with the arm stretched, fast with it folded (as the payload's link is seen
-    from that axis), slow with it stretched, and fast together with a neighbour; and of all axes
-    together.
+    from that axis), and slow with it stretched; of every two neighbouring axes together; and of all
+    axes together.
     """
     cell = experiment.cell
     checker = experiment.scene.checker
@@ -624,11 +624,10 @@ def extra_moves(experiment: Experiment) -> tuple[ExtraMoves, ...]:
         swing(f"fast moves of {name} with the arm stretched", stretched, [axis])
         swing(f"fast moves of {name} with the arm folded", folded, [axis])
         swing(f"slow moves of {name} with the arm stretched", stretched, [axis], SLOW_SHARE)
-        other = axis + 1
-        if other == len(names):
-            other = axis - 1
-        if other >= 0:
-            swing(f"fast moves of {name} and {names[other]} together", clear, [axis, other])
+        following = axis + 1
+        if following < len(names):
+            words = f"fast moves of {name} and {names[following]} together"
+            swing(words, clear, [axis, following])
     swing("fast moves of all axes", clear, list(range(len(names))))
     return tuple(found)
 

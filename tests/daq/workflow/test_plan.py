@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ from daq.config.cell import Cell
 from daq.config.cell_file import load_cell
 from daq.config.workspace import Clearance
 from daq.errors import ConfigurationInconsistent, PlanTooShort, UsageError
-from daq.workflow.experiment import Experiment, experiment_of, paths_of
+from daq.workflow.experiment import Experiment, experiment_of, extra_moves, paths_of
 from daq.workflow.plan import LONGEST_S, Plan, longer_run_s, nearly_right_joints, plan, slowed
 from drivers.move import Trapezoid
 from ident.planning.clearance import BASE, Box, Capsule
@@ -345,3 +346,13 @@ def test_guessed_bodies_that_never_keep_the_distance_belong_together(demo: Cell)
     assert set(scene.together) < set(closer.together)
     moves = plan(near, seed=1, duration_s=30.0, exchanges=0).moves
     assert len(moves) >= 5
+
+
+def test_each_two_neighbouring_axes_are_tried_together_once(experiment: Experiment) -> None:
+    """The same two in the other order would make the same moves."""
+    extras = extra_moves(experiment)
+    together = [extra.words for extra in extras if extra.words.endswith("together")]
+    names = experiment.cell.axis_names
+    assert together == [
+        f"fast moves of {first} and {second} together" for first, second in pairwise(names)
+    ]
