@@ -133,8 +133,8 @@ def scene_of(cell: Cell, robot: Robot, mass_kg: float) -> CheckedScene:
     payload_link = None
     if not any(capsule.link == carrier for capsule in capsules):
         payload_link = _link_name(cell, robot, carrier)
-        # Around a steel cube of that mass: from the mounting to three of its sides away, with the
-        # round ends.
+        # Around a steel cube of that mass, along the joint's axis. The round ends have one side as
+        # their radius: with them it reaches from the mounting to three sides away.
         side_m = side_of_cube(mass_kg)
         axis = robot.joints[carrier].axis
         start_m = point_of(robot.mounting_m + side_m * axis)
@@ -142,6 +142,7 @@ def scene_of(cell: Cell, robot: Robot, mass_kg: float) -> CheckedScene:
         payload = Capsule(PAYLOAD, carrier, start_m, end_m, radius_m=side_m)
         capsules = (*capsules, payload)
     candidates = _pairs_of_separate_links(robot, capsules)
+    # What the workspace confines: everything on the link with the payload
     confined = tuple(index for index, capsule in enumerate(capsules) if capsule.link == carrier)
     scene_of_all_pairs = Scene(
         capsules=capsules,
@@ -154,8 +155,8 @@ def scene_of(cell: Cell, robot: Robot, mass_kg: float) -> CheckedScene:
     limits = limits_of(cell)
     rng = np.random.default_rng(0)
     postures = rng.uniform(limits.lower, limits.upper, (POSTURES, len(cell.axes)))
-    # Two guessed capsules that never keep the least distance are as little worth checking as two
-    # that always touch: each grows by half of that distance.
+    # Two guessed capsules that never keep the least distance are not checked, as two that always
+    # touch: each grows by half of that distance, so that they touch here.
     grown = []
     for number, capsule in enumerate(capsules):
         radius_m = capsule.radius_m
@@ -332,7 +333,8 @@ class Experiment:
         motor_early = np.abs(train.direction @ early)
         motor_late = np.abs(train.direction @ late)
         motor_moves = np.minimum(motor_early, motor_late) > standstill
-        # Motor i's equation mixes the joints in row i of T; each of them must move.
+        # Motor i's equation mixes the joints in row i of T, and those that turn the motor; each of
+        # them must move.
         is_mixed = np.abs(train.to_motor) > 0
         is_turned = np.abs(train.direction) > 0
         uses = []
@@ -430,7 +432,8 @@ def _effort_remarks(
             refuted.append(name)
     if unknown:
         lines.append(
-            f"torque limits: the URDF has no `effort` of {', '.join(unknown)}; not kept there"
+            f"torque limits: the URDF has no `effort` of {', '.join(unknown)}; their torque is not "
+            "limited"
         )
     if refuted:
         if from_urdf:
@@ -439,8 +442,8 @@ def _effort_remarks(
             masses = "guessed masses of the links"
         lines.append(
             f"torque limits: with {masses}, gravity alone asks more than the `effort` of "
-            f"{', '.join(refuted)} in the URDF; not kept there. Correct `effort` or the masses; "
-            "the planner knows no balancer"
+            f"{', '.join(refuted)} in the URDF; their torque is not limited. Correct `effort` or "
+            "the masses; the planner knows no balancer"
         )
     return tuple(lines)
 
@@ -461,7 +464,7 @@ def _torque_times(path: Trapezoid) -> FloatArray:
     return np.concatenate([*pieces, at_rest])
 
 
-#: Scene without bodies: a checker of it knows the closures of a robot alone
+#: Scene without bodies: its checker checks nothing but the closures of a robot
 EMPTY_SCENE = Scene((), (), (), None, (), 0.0)
 
 
@@ -563,6 +566,8 @@ def experiment_duration_s(cell: Cell, moves: Sequence[PlannedMove]) -> float:
 #: Least duration of the extra moves of each kind, so that the kinds can be compared
 EXTRA_MOVES_S = 5.0
 EXTRA_POSTURES = 300  #: Random postures in which extra moves are tried
+#: The same for a closed chain, for which each posture takes a way of its own
+EXTRA_POSTURES_OF_CHAIN = 20
 SWINGS = 3  #: Most postures in which the extra moves of one kind are made
 SLOW_SHARE = 0.2  #: Share of the speed limit at which gravity excites more than inertia
 STROKES = (1.0, 0.7, 0.4)  #: Shares of the range that are tried until the way is clear
@@ -581,10 +586,10 @@ def extra_moves(experiment: Experiment) -> tuple[ExtraMoves, ...]:
     limits = limits_of(cell)
     low, high = limits.targets()
     rng = np.random.default_rng(0)
-    sampled = rng.uniform(low, high, (EXTRA_POSTURES, len(low)))
     if checker.robot.is_constrained:
-        rng = np.random.default_rng(0)
-        sampled = _allowed(checker, rng, low, high, EXTRA_POSTURES // 15)
+        sampled = _allowed(checker, rng, low, high, EXTRA_POSTURES_OF_CHAIN)
+    else:
+        sampled = rng.uniform(low, high, (EXTRA_POSTURES, len(low)))
     clear = sampled[checker.margins(sampled) > 0.0]
     found: list[ExtraMoves] = []
     ends_of = _swing
