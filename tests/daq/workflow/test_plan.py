@@ -326,6 +326,18 @@ def test_two_declared_bodies_that_are_always_too_close_are_named(demo: Cell) -> 
     assert "workspace" not in refused.value.remedy
 
 
+def test_a_guessed_payload_that_is_often_too_close_is_to_be_declared(demo: Cell) -> None:
+    """It is the only body that the cell file does not have."""
+    column = Capsule("column", BASE, (0.0, 0.0, 0.0), (0.0, 0.0, 0.4), 0.35)
+    clearance = Clearance(None, 0.1, (column,), ())
+    crowded = replace(demo, clearance=clearance)
+    with pytest.raises(UsageError, match=r"column and payload are at most") as refused:
+        plan(crowded, seed=1)
+    assert "the shape of the payload is guessed: declare a capsule on link J6" in (
+        refused.value.remedy
+    )
+
+
 def test_an_obstacle_around_the_arm_is_named(demo: Cell) -> None:
     lower_m = (-2.0, -2.0, -2.0)
     upper_m = (2.0, 2.0, 2.0)
