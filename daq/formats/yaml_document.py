@@ -84,8 +84,7 @@ class YamlDocument(ControllerDocument):
                 raise self.unfit(key, found, "write it out")
         if not isinstance(node, ScalarNode):
             raise self.unfit(key, "a list or mapping", "name the key of a number")
-        # The number is at the end of its node: an anchor or a tag may precede it. An escape within
-        # quotes makes its text another than its value.
+        # The number is at the end of its node: an anchor or a tag may precede it.
         quote = node.style or ""
         end = node.end_mark.index - len(quote)
         start = end - len(node.value)
@@ -94,6 +93,7 @@ class YamlDocument(ControllerDocument):
             is_at_begin = before == quote
         else:
             is_at_begin = start == node.start_mark.index or before.isspace()
+        # With an escape within the quotes, the text is another than the value.
         is_literal = is_at_begin and self.text[start:end] == node.value
         if not is_literal or not DECIMAL.fullmatch(node.value):
             raise self.unfit(key, f"{node.value!r:.60}", "write a plain decimal number")
@@ -104,7 +104,7 @@ class YamlDocument(ControllerDocument):
             )
             raise self.unfit(key, found, "write it without leading zeros")
         # A tag may not make the number a text or an integer: a new gain has a point, and is no
-        # integer even where this one is.
+        # integer even where this one is. A bare ! makes it a text, whatever the parser calls it.
         properties = self.text[node.start_mark.index : start].split()
         tags = [part for part in properties if part.startswith("!")]
         if tags and (tags[0] == "!" or node.tag != _FLOAT):
@@ -121,11 +121,13 @@ class YamlDocument(ControllerDocument):
             ControllerUnfit: there is none, or more than one.
         """
         place = ".".join(walked) or "the file"
-        if isinstance(node, SequenceNode) and step.isdecimal():
-            position = int(step)
-            if position < len(node.value):
-                child: Node = node.value[position]
+        if isinstance(node, SequenceNode):
+            if step.isdecimal() and int(step) < len(node.value):
+                child: Node = node.value[int(step)]
                 return child
+            positions = ", ".join(str(position) for position in range(len(node.value))[:12])
+            has = positions or "nothing"
+            raise self.lacking(key, f"no key {step!r} in {place} (it has {has})")
         if not isinstance(node, MappingNode):
             raise self.lacking(key, f"no key {step!r} in {place}")
         names: list[str] = []
@@ -151,7 +153,8 @@ def yaml_document(content: bytes, name: str) -> YamlDocument:
     """Parse a YAML document.
 
     Raises:
-        ControllerUnfit: the bytes are not UTF-8, or too many for the two parsers.
+        ControllerUnfit: the bytes are not UTF-8, or the file is too large, has too many values or
+            is nested too deeply for the two parsers.
     """
     _check_size(content, name)
     return YamlDocument(name, utf8(content, name, "YAML"))
@@ -261,7 +264,7 @@ def _values(root: Any) -> dict[KeyPath, str]:
         else:
             values[*path, "{}"] = str(len(node.value))
             for position, (name, value) in enumerate(node.value):
-                step = f"? {position}"
+                step = f"? {position}"  # YAML's mark of a key that is a list or mapping
                 if isinstance(name.value, str):
                     step = name.value
                 waiting.append(((*path, step), value))

@@ -160,8 +160,10 @@ MAY_LACK = (
 
 
 def read_history(ledger: Ledger) -> History:
-    """Read the history of a cell, as far as the audit log is what was written (`may_lack`);
-    nothing is written.
+    """Read the history of a cell, as far as the audit log is what was written (`may_lack`).
+
+    Nothing is entered. In a history of an earlier version the unfinished transaction of a killed
+    writer is undone (`read_stored`).
 
     Raises:
         AuditUnusable: the audit log is no regular file, or it cannot be read.

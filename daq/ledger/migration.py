@@ -42,7 +42,7 @@ VERSION = 1  #: Version of its tables; there was no other
 class StoredHistory:
     """Content of the file."""
 
-    #: oldest first; their entry has the number 0, and they have no figures
+    #: oldest first; without figures, and with 0 as the number of their entry in the audit log
     calibrations: tuple[EnteredCalibration, ...]
     events: tuple[Event, ...]  #: writes to controllers, oldest first
     acknowledgements: tuple[Acknowledgement, ...]  #: oldest first
@@ -71,14 +71,17 @@ class EntryDraft:
 
 
 def read_stored(path: Path) -> StoredHistory:
-    """Read a history of an earlier version, and check its consistency; nothing is changed.
+    """Read a history of an earlier version, and check its consistency.
+
+    Nothing is changed, but SQLite undoes the unfinished transaction of a killed writer: the file is
+    then as before that transaction, and its journal is gone.
 
     Raises:
         HistoryInaccessible: it is locked for long, or its rights do not let it be read.
         HistoryUnreadable: it is none, of a later version, or broken.
     """
-    # "rw" undoes the unfinished transaction of a killed writer, which "ro" cannot, and opens a
-    # read-only file, too.
+    # With "ro" SQLite could not undo such a transaction, and would refuse the file. With "rw" it
+    # opens a file without the right to write for reading.
     quoted = quote(os.fsencode(path.absolute()))
     address = f"file:{quoted}?mode=rw"
     with (
@@ -99,6 +102,17 @@ def read_stored(path: Path) -> StoredHistory:
         if damage:  # rows of a broken file prove nothing
             return replace(EMPTY, flaws=damage)
         return _read_rows(connection)
+
+
+_INACCESSIBLE = (
+    "SQLITE_BUSY",
+    "SQLITE_LOCKED",
+    "SQLITE_CANTOPEN",
+    "SQLITE_PERM",
+    "SQLITE_READONLY",
+    "SQLITE_IOERR",
+)
+"""Prefixes of the names of SQLite's errors after which the content of the file is unknown."""
 
 
 @contextlib.contextmanager
@@ -123,17 +137,6 @@ def _translate_errors(path: Path) -> Iterator[None]:
                 "was changed",
             ) from error
         raise _unreadable(path, found) from error
-
-
-_INACCESSIBLE = (
-    "SQLITE_BUSY",
-    "SQLITE_LOCKED",
-    "SQLITE_CANTOPEN",
-    "SQLITE_PERM",
-    "SQLITE_READONLY",
-    "SQLITE_IOERR",
-)
-"""Prefixes of the names of SQLite's errors after which the content of the file is unknown."""
 
 
 def _unreadable(path: Path, found: str) -> HistoryUnreadable:
@@ -164,13 +167,13 @@ def _read_calibrations(connection: sqlite3.Connection) -> Iterator[EnteredCalibr
     """Yield the calibrations of the file, oldest first."""
     query = "SELECT digest, entered, document FROM calibration ORDER BY created, digest"
     for digest, entered_text, document in connection.execute(query):
-        entered = zoned(entered_text)
+        entered = zoned(_text(entered_text))
         yield EnteredCalibration(
             number=0,
-            digest=str(digest),
-            at=entered,
+            digest=_text(digest),
+            at=entered,  # no entry of the audit log has a time of its own for it
             entered=entered,
-            document=str(document),
+            document=_text(document),
             figures=None,
         )
 
@@ -180,13 +183,13 @@ def _read_events(connection: sqlite3.Connection) -> Iterator[Event]:
     query = "SELECT digest, deed, at, who, target, audit, sha256_after FROM event ORDER BY number"
     for digest, deed, at, who, target, audit, sha256_after in connection.execute(query):
         yield Event(
-            digest=digest,
-            action=WriteAction(deed),
-            at=zoned(at),
-            who=_with_surrogates(who),
-            target=_with_surrogates(target),
-            audit=audit,
-            sha256_after=sha256_after,
+            digest=_text_or_none(digest),
+            action=WriteAction(_text(deed)),
+            at=zoned(_text(at)),
+            who=_with_surrogates(_text(who)),
+            target=_with_surrogates(_text(target)),
+            audit=_text_or_none(audit),
+            sha256_after=_text_or_none(sha256_after),
         )
 
 
@@ -195,13 +198,31 @@ def _read_acknowledgements(connection: sqlite3.Connection) -> Iterator[Acknowled
     query = "SELECT axis, since, at, who, why, audit FROM acknowledgement ORDER BY number"
     for axis, since, at, who, why, audit in connection.execute(query):
         yield Acknowledgement(
-            axis=axis,
-            since=zoned(since),
-            at=zoned(at),
-            who=_with_surrogates(who),
-            why=_with_surrogates(why),
-            audit=audit,
+            axis=_text(axis),
+            since=zoned(_text(since)),
+            at=zoned(_text(at)),
+            who=_with_surrogates(_text(who)),
+            why=_with_surrogates(_text(why)),
+            audit=_text(audit),
         )
+
+
+def _text(value: object) -> str:
+    """Return the text of a column. Tables of drivegain are STRICT and have nothing else there.
+
+    Raises:
+        ValueError: the value is no text.
+    """
+    if isinstance(value, str):
+        return value
+    raise ValueError(f"{value!r:.40} where text belongs")
+
+
+def _text_or_none(value: object) -> str | None:
+    """Return the text of a column that may be empty; see `_text`."""
+    if value is None:
+        return None
+    return _text(value)
 
 
 def _with_surrogates(text: str) -> str:
@@ -279,6 +300,7 @@ def _calibration_drafts(
             "entered": iso(calibration.entered),
             "figures": figures,
         }
+        # An earlier entry of the audit log has the document of the others.
         if calibration.digest not in known_digests:
             details["document"] = calibration.document
         subject = history_subject(cell)
@@ -293,8 +315,8 @@ def history_subject(cell: str) -> str:
 def _event_drafts(
     stored: Iterable[Event], entries: Sequence[AuditEntry], cell: str
 ) -> Iterator[EntryDraft]:
-    """Yield entries for the writes of which the audit log has no end, and no earlier entry of
-    a migration.
+    """Yield entries for the writes that the audit log does not have to the end; without those that
+    an earlier migration has entered.
     """
     entry_by_digest = {entry.sha256: entry for entry in entries}
     known_writes = set()
@@ -327,7 +349,8 @@ def _acknowledgement_drafts(
 ) -> Iterator[EntryDraft]:
     """Yield entries for acknowledgements that the audit log does not have for this cell.
 
-    It may have one without the cell's name, which the first versions did not enter.
+    The first versions entered them without the name of the cell: such an entry counts for no cell,
+    and the acknowledgement is entered again.
     """
     entered = list(acknowledgements_of(entries, cell))
     known_digests = {acknowledgement.audit for acknowledgement in entered}

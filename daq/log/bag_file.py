@@ -13,6 +13,7 @@ from collections.abc import Generator, Iterator
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import NoReturn
 
 import zstandard
 
@@ -35,13 +36,14 @@ from daq.log.ros1_bag import ROS_1_MAGIC, Ros1Bag, more_behind
 from daq.log.table import kind_of_content
 
 SQLITE_MAGIC = b"SQLite format 3\0"
-#: Instructions of SQLite for any file, and STEPS_A_BYTE more for each byte of it; reading a message
-#: takes 20
+#: Most instructions of SQLite for any file, and STEPS_A_BYTE more for each byte of it; reading a
+#: message takes 20
 STEPS = 10_000_000
 STEPS_A_BYTE = 2
 STEPS_A_COUNT = 1000  #: Instructions after which SQLite calls `_count_steps`
 BYTES_A_TOPIC = 64  #: Least size of a topic in the file
 PIECE_BYTES = 2**20  #: Unpacked at a time
+PACKED_SUFFIXES = (".zstd", ".zst")  #: Of a file that is packed by zstd: ROS 2's, and zstd's own
 
 
 class SqliteBag:
@@ -50,10 +52,12 @@ class SqliteBag:
     """
 
     def __init__(self, path: Path, source: Path) -> None:
-        """Store the path and where the content is."""
+        """Store the path, which errors name, and that of the content: another one if the file at
+        the first is packed.
+        """
         self.path = path
         self._source = source
-        self._counts_left = 0
+        self._counts_left = 0  # calls of `_count_steps` before SQLite is stopped
         self._bytes_left = 0
 
     def messages(self) -> Generator[BagMessage, None, None]:
@@ -132,7 +136,7 @@ class SqliteBag:
     def _topics(self, database: sqlite3.Connection) -> dict[int, Topic]:
         """Return the topics by their id."""
         topics: dict[int, Topic] = {}
-        # Counted, not searched for among the topics before: a file may have very many.
+        # A counter, as a file may have very many topics: a search of those before takes too long.
         channels = Counter[str]()
         query = "SELECT id, name, type, serialization_format FROM topics"
         for topic_id, stored_name, schema, encoding in database.execute(query):
@@ -150,19 +154,28 @@ class SqliteBag:
             raise self.corrupt(row, "more bytes than the file has", "a recording")
 
     def _refuse_unfinished(self) -> None:
-        """Refuse a file next to which SQLite has left its log or journal:
-        the file would be read without what is in there.
+        """Refuse a file next to which SQLite has left its write-ahead log or rollback journal:
+        the file would be read without the messages of the log, or with half of a change.
         """
-        name = self.path.name
-        for suffix in ("-wal", "-journal"):
-            rest = self.path.with_name(f"{name}{suffix}")
+        database = self.path
+        unpack = ""
+        # Of a packed file they have the name that it had before it was packed.
+        if self._source != self.path and self.path.suffix in PACKED_SUFFIXES:
+            database = self.path.with_suffix("")
+            unpack = f" unpack the copy (`zstd -d {self.path.name} -o {database.name}`),"
+        contents = {
+            "-wal": "with messages that are not in the bag yet",
+            "-journal": "which undoes a change that was not finished",
+        }
+        for suffix, content in contents.items():
+            rest = database.with_name(f"{database.name}{suffix}")
             if rest.exists() and rest.stat().st_size > 0:
                 raise LogTruncated(
                     str(self.path),
-                    found=f"{rest.name}, with messages that are not in it yet",
+                    found=f"{rest.name}, {content}",
                     expected="a finished bag",
-                    remedy=f"the recorder was killed: copy both, and run `sqlite3 {name} 'PRAGMA "
-                    "quick_check'` there",
+                    remedy=f"the recorder was killed: copy both,{unpack} and run `sqlite3 "
+                    f"{database.name} 'PRAGMA quick_check'` there",
                 )
 
     def _broken(
@@ -179,7 +192,7 @@ class SqliteBag:
 def open_bag(path: Path) -> Iterator[McapBag | SqliteBag | Ros1Bag]:
     """Open a file of a bag as the kind that its first bytes show.
 
-    Damage behind these bytes is reported with the messages.
+    Damage behind these bytes is an error of the iteration over its messages.
 
     Raises:
         LogMissing: it cannot be opened, or a packed one cannot be read.
@@ -187,7 +200,7 @@ def open_bag(path: Path) -> Iterator[McapBag | SqliteBag | Ros1Bag]:
         LogForeign: it is of another kind.
         LogCorrupt: it is empty; or it is packed, and the content is damaged, empty, or larger than
             that of a recording.
-        OutputFailed: there is no room for the unpacked content.
+        OutputFailed: there is no folder or no room for the unpacked content.
     """
     if path.is_file() and path.stat().st_size == 0:
         raise LogCorrupt(
@@ -199,7 +212,11 @@ def open_bag(path: Path) -> Iterator[McapBag | SqliteBag | Ros1Bag]:
     if not first_bytes(path).startswith(ZSTD_MAGIC):
         yield _bag(path, path)
         return
-    with TemporaryDirectory() as folder:
+    try:
+        temporary = TemporaryDirectory()
+    except OSError as error:
+        raise _no_room("folder for temporary files", error, path) from error
+    with temporary as folder:
         source = Path(folder) / "bag"
         _unpack_file(path, source)
         if source.stat().st_size == 0:
@@ -208,7 +225,7 @@ def open_bag(path: Path) -> Iterator[McapBag | SqliteBag | Ros1Bag]:
 
 
 def _bag(path: Path, source: Path) -> McapBag | SqliteBag | Ros1Bag:
-    """Return the bag with the content of `source`; messages name `path`."""
+    """Return the bag with the content of `source`; errors name `path`."""
     head = first_bytes(source)
     if head.startswith(SQLITE_MAGIC):
         return SqliteBag(path, source)
@@ -219,7 +236,7 @@ def _bag(path: Path, source: Path) -> McapBag | SqliteBag | Ros1Bag:
     return McapBag(path, source)
 
 
-def _refuse_other_kind(path: Path, source: Path, head: bytes) -> None:
+def _refuse_other_kind(path: Path, source: Path, head: bytes) -> NoReturn:
     """Refuse a file without the first bytes of a bag.
 
     Raises:
@@ -267,12 +284,16 @@ def _unpack_file(path: Path, target: Path) -> None:
             for piece in _unpacked_pieces(path):
                 stream.write(piece)
     except OSError as error:
-        raise OutputFailed(
-            str(target),
-            found=reason_of(error),
-            expected=f"room for what {path.name} unfolds to",
-            remedy="free space, or name another folder in the environment variable TMPDIR",
-        ) from error
+        raise _no_room(str(target), error, path) from error
+
+
+def _no_room(subject: str, error: OSError, path: Path) -> OutputFailed:
+    return OutputFailed(
+        subject,
+        found=reason_of(error),
+        expected=f"room for what {path.name} unfolds to",
+        remedy="free space, or name another folder in the environment variable TMPDIR",
+    )
 
 
 def _unpacked_pieces(path: Path) -> Iterator[bytes]:
@@ -290,7 +311,7 @@ def _unpacked_pieces(path: Path) -> Iterator[bytes]:
             while piece := reader.read(PIECE_BYTES):
                 bytes_left -= len(piece)
                 if bytes_left < 0:
-                    found = f"a file that unfolds to {LARGEST_RATIO} times its size"
+                    found = f"a file that unfolds to more than {LARGEST_RATIO} times its size"
                     raise _not_unpacked(path, found)
                 yield piece
     except zstandard.ZstdError as error:

@@ -42,7 +42,9 @@ class Salvaged:
     statistics: RunStatistics
     duration_s: float  #: duration of the samples [s]
     left_out_bytes: int  #: size of the damaged file from the first damaged byte
-    damage: str  #: description of the damage; empty if only the end of the file is missing
+    #: Description of the damage, also where the file only ends too early; empty where the recording
+    #: itself ends with its closing mark, and only the summary behind it is missing or damaged.
+    damage: str
 
 
 def salvage(
@@ -59,7 +61,8 @@ def salvage(
         UsageError: the recorder still writes the file, the file is whole, or `out` is the name
             that the whole recording would have.
         UsageError, OutputFailed: the log cannot be written.
-        LogUnreadable: not even one sample, or not the start of the log, can be saved.
+        LogUnreadable: not even one sample, or not the start of the log, can be saved; or samples or
+            readings are of another number of axes than the cell.
         ConfigurationError: the cell configuration in it is inconsistent.
     """
     _refuse_running(damaged)
@@ -71,13 +74,7 @@ def salvage(
             remedy=f"choose another --out, such as {out.stem}-partial{out.suffix}",
         )
     if not damaged.name.endswith(UNFINISHED):
-        with suppress(LogUnreadable):
-            for _ in LogReader(damaged):
-                pass
-            expected = "a damaged or unfinished one"
-            raise UsageError(
-                str(damaged), found="a whole log", expected=expected, remedy="use it as it is"
-            )
+        _refuse_whole(damaged)
     reader = LogReader(damaged)
     blocks = reader.until_damage()
     first_block = next(blocks, None)
@@ -85,14 +82,17 @@ def salvage(
         if isinstance(reader.damage, LogTruncated):
             found = f"{reader.damage.found}, and no samples"
             raise _nothing_saved(damaged, found) from reader.damage
-        raise reader.damage or _nothing_saved(damaged, "no samples")
+        if reader.damage is not None:
+            raise reader.damage
+        raise _nothing_saved(damaged, "no samples")
     head = reader.head
     cell = head.cell(damaged)
     scale = scaling(cell, head.readback)
     origin = f"{head.run.origin}; salvaged from {damaged.name}"
     run = replace(head.run, origin=origin)
     content = LogContent.of(cell, run, head.files, head.readback)
-    # A crash loses only this new file, which can be made again: it needs no flushes by a clock.
+    # A crash loses only this new file, which can be made again. So a clock that stands still
+    # flushes nothing, and an unfinished file is not kept.
     with LogWriter(
         out, content, scale.joint_position_of, clock_ns=lambda: 0, keeps_part=False
     ) as log:
@@ -151,7 +151,8 @@ def _copy(
         faults = _faults_of_recorder(reader)
     else:
         faults = _faults_of_samples(reader, log.statistics)
-    # The watch wants the recorder's verdict alone of these statistics.
+    # The watch takes only the verdict of these statistics: the recorder's, or else that of the
+    # samples and events.
     judged = RunStatistics(0, 0, (), valid=not faults, reason=", ".join(faults))
     valid, reason = watch.verdict(
         reader.checks, judged, lambda: LogReader(reader.path).until_damage()
@@ -211,6 +212,25 @@ def _foreign(path: Path, found: str, expected: str) -> LogIncomplete:
         found=found,
         expected=f"{expected}, as in its cell configuration",
         remedy="it is not a recording of this software",
+    )
+
+
+def _refuse_whole(log: Path) -> None:
+    """Refuse a log that can be read to its end.
+
+    Raises:
+        UsageError: it can.
+    """
+    try:
+        for _ in LogReader(log):
+            pass
+    except LogUnreadable:
+        return
+    raise UsageError(
+        str(log),
+        found="a whole log",
+        expected="a damaged or unfinished one",
+        remedy="use it as it is",
     )
 
 

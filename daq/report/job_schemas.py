@@ -41,16 +41,21 @@ class FleetCell(Report):
     cell: str
     configuration_sha256: str | None
     configurations: int
+    """of this cell; each of them has an entry"""
     fit: list[str]
     holdout: list[str]
     gains: list[FleetGain]
     worst: FleetGain | None
+    """gain with the largest relative standard deviation"""
     error_percent: Figure
     error_on: Literal["holdout", "fit"] | None
     effects: list[FleetEffect]
     partial: bool | None
+    """whether a log of the fit was salvaged"""
     seconds: float
+    """time that the fit took"""
     kept: bool
+    """whether the calibration is from an earlier call, with the same logs"""
     calibration: str | None
     exit_code: int
     error: FleetFailure | None
@@ -110,11 +115,11 @@ class ConcludedJob(RefusedJob):
     folder: str
 
 
+# Pydantic puts the keys of the last base first: how the job ended comes before its state.
 class JobReport(JobState, ConcludedJob):
     """`recalibrate`: what is left to do, and the state of its session."""
 
-    # The keys of the last base come first. Both bases have these two: their types are those of a
-    # job that has ended.
+    # Both bases have these two keys: their types are those of a job that has ended.
     outcome: Outcome
     exit_code: int
 
@@ -122,6 +127,7 @@ class JobReport(JobState, ConcludedJob):
 class SessionReport(GuidedState, ConcludedJob):
     """`calibrate`: what is left to do, and the state of its session."""
 
+    # As in `JobReport`
     outcome: Outcome
     exit_code: int
 
@@ -131,8 +137,9 @@ class ProposedGain(Report):
 
     axis: str
     key: str
+    """under which the file has the gain"""
     old: Figure
-    """current gain; the key keeps its name"""
+    """current gain"""
     new: Figure
     std: float
     unit: str
@@ -151,7 +158,9 @@ class ProposalReport(Report):
 
     file: str
     base_sha256: str
+    """of the file before the change"""
     after_sha256: str
+    """of the file after it"""
     changes: list[ProposedGain]
     refusals: list[FailedCheck]
 
@@ -166,6 +175,7 @@ class DemoGain(Report):
     truth: float
     error_percent: float
     paper_tls: Figure
+    """gain by total least squares, the estimator of the paper"""
 
 
 class DemoPlan(Report):
@@ -173,6 +183,7 @@ class DemoPlan(Report):
 
     moves: int
     condition: float
+    """condition number"""
     predicted_std_percent: list[Figure]
 
 

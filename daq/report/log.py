@@ -1,5 +1,5 @@
-"""Logs: what verbs say of those that they write,
-and the contents as `drivegain info` shows them.
+"""Reports of the verbs that write a log,
+and the contents of one as `drivegain info` shows them.
 """
 
 from __future__ import annotations
@@ -66,12 +66,19 @@ class StampSummary(Report):
     usual_step_s: float
     longest_step_s: float
     jitter_s: float
+    """standard deviation of the steps, missing samples apart"""
     drift_s: float
+    """largest distance of a stamp from a uniform clock that starts with the first one"""
     missing: int
+    """samples between the first and the last that were interpolated"""
     resampled: bool
+    """whether the samples were moved to a uniform clock"""
     duplicates: int
+    """rows that repeat the one before and were left out"""
     close: int
+    """samples too close to the one before to give a speed, which were left out"""
     started_s: Figure
+    """first stamp by the file's clock; null before zero, as of a trigger's"""
 
 
 class MountedPayload(Report):
@@ -103,13 +110,16 @@ class InfoReport(Report):
     cell_sha256: str
     axes: list[str]
     current: dict[str, str]
+    """by axis: what was recorded as its current, an object of its drive or a column of a file"""
     role: str
     payload: MountedPayload | None
     rate_hz: float
     speed: float
+    """speed of the moves as a share of the plan's"""
     samples: int
     duration_s: float
     stamped_duration_s: float
+    """from the first stamp to the last; `duration_s` counts the samples"""
     moves: int
     slow_readings: dict[str, int]
     lost_cycles: int
@@ -123,6 +133,7 @@ class InfoReport(Report):
     started: str | None
     wall_minus_monotonic_s: float
     wall_clock_step_s: Figure
+    """how far the wall clock was set during the run; null where it was not read at the end"""
     origin: str
     timing: StampSummary | None
     attachments: dict[str, int]
@@ -160,7 +171,9 @@ class SalvageReport(Report):
     reason: str
     """why it is not valid"""
     left_out_bytes: int
+    """size of the damaged file from the first damaged byte"""
     damage: str
+    """empty where only the summary at the end of the file is missing or damaged"""
 
 
 class TableReport(Report):
@@ -201,15 +214,26 @@ def record_report(path: Path, recorded: Recorded, cell: Cell) -> RecordReport:
             bus=bus.name, mean_percent=100 * load.mean, worst_percent=100 * load.worst
         )
         loads.append(entry)
-    return RecordReport.of(recorded.log, recorded, log=path, bus_load=loads)
+    statistics = recorded.log
+    return RecordReport.of(statistics, recorded, log=path, bus_load=loads)
 
 
-def import_report(path: Path, imported: Imported, holdout: Path | None = None) -> ImportReport:
+def import_report(path: Path, imported: Imported, holdout: Path | None) -> ImportReport:
     """Return the log of an import with its losses, what its time stamps show,
     and the log of its held-out part.
+
+    Args:
+        path: of the log.
+        imported: with or without a held-out part.
+        holdout: the log of that part; None where there is none.
+
+    Raises:
+        ValueError: there is such a part, and no path of its log.
     """
     held_out = None
     if imported.holdout is not None:
+        if holdout is None:
+            raise ValueError("found no path of the log of the held-out part; expected one")
         held_out = HoldoutLog(log=str(holdout), samples=imported.holdout.samples)
     return ImportReport.of(imported.statistics, imported, log=path, holdout=held_out)
 
@@ -307,8 +331,8 @@ def timing_text(timing: Timing) -> str:
 
 
 FOR_PROGRAMS = frozenset({"wall_minus_monotonic_s"})
-"""Keys that a person has no use for: the offset of two clocks,
-of which `wall_clock_step_s` has the change.
+"""Keys that a person has no use for: the offset of two clocks. Its change during the run, which a
+person may want, is `wall_clock_step_s`.
 """
 
 

@@ -33,7 +33,7 @@ class MotorNoise(Report):
     noise: float
     """estimate, in the unit of the current reference"""
     least: Figure
-    """its lower limit where that bounds any model's error: known from repeated moves"""
+    """lower limit of the noise, below which no model's error can be; null without repeated moves"""
     source: str
     std_percent: Figure
     dwells: int | None
@@ -82,7 +82,9 @@ class GearLossEntry(Report):
     efficiency: Figure
     gain_factor: Figure
     hidden_shift: Figure
+    """relative change of the gain by a loss too small to be seen"""
     gain_carries_it: bool
+    """whether a loss that these data do not show could matter to the gain"""
 
 
 class LeftOutRun(Report):
@@ -119,6 +121,7 @@ class ChangedGain(Report):
     after: float
     after_std: Figure
     choice_std: Figure
+    """part of `after_std` from the choice of effects"""
     change_percent: Figure
     change_std_percent: Figure
     significant: bool
@@ -151,15 +154,21 @@ class FindingEntry(NamedEffect):
     """Result of testing one effect on one axis."""
 
     variable: str
+    """abscissa of its picture"""
     coefficients: list[Coefficient]
     probability: Figure
     """by noise alone; null where it rests on too few moves for a test"""
     folds_better: float
+    """share of the folds of left-out moves in which the error falls"""
     explained: Figure
+    """share of the squared residual of the most affected motor"""
     error_before_percent: Figure
     error_after_percent: Figure
     error_fall: Figure
+    """relative, of that motor on left-out moves"""
     held_out_fall: Figure
+    """fall of the squared error on moves left out in folds, in variances of the noise; not on
+    held-out runs, despite its name"""
     passed: bool
     share_of_excess: Figure
     refusals: list[str]
@@ -181,9 +190,10 @@ class DetectionLimit(Report):
 
 
 class SplitNameEntry(NamedEffect):
-    """Name that splits of the data choose for what a turn added."""
+    """Name of the best candidate when a part of the moves is left out of the choice."""
 
     splits: int
+    """number of such parts with which this name is chosen"""
 
 
 class TurnEntry(Report):
@@ -198,6 +208,7 @@ class TurnEntry(Report):
     gain_changes: list[ChangedGain] | None
     findings: list[FindingEntry]
     structures: list[FindingEntry]
+    """smooth and periodic terms, of no named effect"""
     set_aside: list[AsideEntry]
     detection_limits: list[DetectionLimit]
 
@@ -209,6 +220,7 @@ class VerdictEntry(NamedEffect):
     reason: str
     written: bool
     blocks: int
+    """independent blocks of held-out moves"""
     error_before_percent: Errors | None
     error_after_percent: Errors | None
 
@@ -239,7 +251,7 @@ class ResidualFormat(Report):
     version: int
 
 
-# The keys of the last base come first.
+# Pydantic puts the keys of the last base first: the file begins with its format.
 class ResidualFile(ResidualReport, ResidualFormat):
     """`residual.json`."""
 
@@ -336,7 +348,8 @@ def _motor_noise(axis: str, floor: MotorNoiseFloor, left_a: float) -> MotorNoise
 def _turn(fitted: Fit, step: Step, turn: BeforeAfter | None) -> TurnEntry:
     """Return one turn of the search; `turn` is None where it changed nothing."""
     places = fitted.cell.place_names
-    # Without a change, `TurnEntry.of` makes the other keys of a change null.
+    # Without a change, the other keys of one are null: `TurnEntry.of` makes null what it is not
+    # given, as its source is None.
     changes: dict[str, Any] = {"added": [], "removed": []}
     if turn is not None:
         added = []

@@ -44,7 +44,9 @@ class UrdfJoint(Report):
     damping: float
     friction: float
     smallest_eigenvalue: float
+    """of its pseudo-inertia, as a share of its prior's"""
     prior_assumed: bool
+    """whether the URDF had no possible inertia, and a ball was assumed"""
 
 
 class NotInUrdf(Report):
@@ -68,11 +70,14 @@ class UrdfReport(Report):
     torque_change_percent: Errors
     shifts: list[ShiftedParameter]
     margin: float
+    """least `smallest_eigenvalue` that is allowed"""
     joints: list[UrdfJoint]
     parameters: list[ChosenParameter]
     merged_links: list[str]
     not_in_urdf: list[NotInUrdf]
     effects_left_out: list[str]
+    """all effects of the calibration: the torque of the URDF is without them, and its joints are as
+    described also where the calibration corrects the description"""
     closures_left_out: list[str]
 
 
@@ -122,6 +127,7 @@ def urdf_view(
         name = f"{effect.name} on {effect.axis}"
         if effect.name not in CORRECTIONS:
             left_out.append(name)
+        # A correction of zero is in the cell file since the fit.
         elif any(coefficient.value != 0.0 for coefficient in effect.coefficients):
             corrected.append(name)
     left_out += missing
@@ -223,9 +229,11 @@ def urdf_report(
 
 
 def _is_of_motor(name: str) -> bool:
-    """Whether a parameter is of a motor, which a URDF has no place for.
+    """Whether a parameter is of a motor, which a URDF has no place for: inertia of a rotor (Ia and
+    Iam), offset (off), or friction of a motor that turns with several joints (fvm, fsm).
 
-    What a payload adds to friction (LOADED) is no part of the robot without one.
+    What a payload adds to friction (LOADED) is no part of the robot without one, which a URDF
+    describes: it is not listed as left out either.
     """
     return name.startswith(("Ia", "off", "fvm", "fsm")) and not name.endswith(LOADED)
 

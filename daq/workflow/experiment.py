@@ -12,7 +12,7 @@ import numpy as np
 
 from daq.config.cell import Cell, WeighedPayload, model_of
 from daq.config.workspace import DEFAULT_MINIMUM_M, Clearance
-from daq.errors import ConfigurationInconsistent
+from daq.errors import ConfigurationInconsistent, counted
 from drivers.move import Trapezoid, synchronised
 from ident.arrays import BoolArray, FloatArray
 from ident.model.robot import JointKind, Motion, Poses, Robot, poses
@@ -55,7 +55,7 @@ LINK_RADIUS_SHARE = 0.08
 6 cm for an arm of the TX-40's size.
 """
 POSTURES = 400  #: Random postures in which capsules are compared
-PAYLOAD = "payload"  #: Name of the capsule of a body that no capsule declares
+PAYLOAD = "payload"  #: Name of the guessed capsule of the payload
 LEAST_APART_SHARE = 0.03
 """Two capsules that are apart in no larger share of random postures are not checked against each
 other: they touch in nearly every posture, as at a shared joint.
@@ -67,9 +67,17 @@ class CheckedScene:
     """A scene, and what an operator must know of it."""
 
     checker: Checker  #: answers whether a way is clear
-    guessed: bool  #: the arm's shape is a guess
+    #: Number of declared capsules, which are the first of the scene; the others are guessed.
+    declared: int
+    #: Link on which a capsule of the payload would have to be declared; None where one is.
+    payload_link: str | None
     #: Names of pairs that are not checked, because they touch in nearly every posture.
     together: tuple[tuple[str, str], ...]
+
+    @property
+    def guessed(self) -> bool:
+        """Whether the arm's shape is a guess."""
+        return self.declared == 0
 
     @property
     def remarks(self) -> tuple[str, ...]:
@@ -77,7 +85,8 @@ class CheckedScene:
         scene = self.checker.scene
         count = len(scene.capsules)
         if not self.guessed:
-            shape = f"shape of the arm: {count} capsules, as declared"
+            capsules = counted(self.declared, "capsule")
+            shape = f"shape of the arm: {capsules}, as declared"
         elif self.checker.robot.is_constrained:
             shape = (
                 "shape of the links: unknown, of a closed chain it is not guessed; declare "
@@ -88,7 +97,13 @@ class CheckedScene:
                 f"shape of the arm: {count} capsules, guessed from the joint chain; declare "
                 "`clearance` in the cell file"
             )
-        lines = [shape, f"clearance: {1000 * scene.minimum_m:.0f} mm"]
+        lines = [shape]
+        if not self.guessed and self.payload_link is not None:
+            lines.append(
+                "shape of the payload: guessed from its mass; declare a capsule on link "
+                f"{self.payload_link} in `clearance.capsules` of the cell file"
+            )
+        lines.append(f"clearance: {1000 * scene.minimum_m:.0f} mm")
         if self.together:
             pairs = [f"{first} and {second}" for first, second in self.together]
             listed = ", ".join(pairs)
@@ -112,11 +127,14 @@ def scene_of(cell: Cell, robot: Robot, mass_kg: float) -> CheckedScene:
         mass_kg: of the payload, which gives the size of its capsule where none is declared.
     """
     declared = cell.clearance or Clearance(None, DEFAULT_MINIMUM_M, (), ())
+    declared_count = len(declared.capsules)
     capsules = declared.capsules or guessed_capsules(robot)
     carrier = robot.carrier
+    payload_link = None
     if not any(capsule.link == carrier for capsule in capsules):
-        # Around a steel cube of that mass: from the mounting to three of its sides away, with the
-        # round ends.
+        payload_link = _link_name(cell, robot, carrier)
+        # Around a steel cube of that mass, along the joint's axis. The round ends have one side as
+        # their radius: with them it reaches from the mounting to three sides away.
         side_m = side_of_cube(mass_kg)
         axis = robot.joints[carrier].axis
         start_m = point_of(robot.mounting_m + side_m * axis)
@@ -124,6 +142,7 @@ def scene_of(cell: Cell, robot: Robot, mass_kg: float) -> CheckedScene:
         payload = Capsule(PAYLOAD, carrier, start_m, end_m, radius_m=side_m)
         capsules = (*capsules, payload)
     candidates = _pairs_of_separate_links(robot, capsules)
+    # What the workspace confines: everything on the link with the payload
     confined = tuple(index for index, capsule in enumerate(capsules) if capsule.link == carrier)
     scene_of_all_pairs = Scene(
         capsules=capsules,
@@ -136,12 +155,12 @@ def scene_of(cell: Cell, robot: Robot, mass_kg: float) -> CheckedScene:
     limits = limits_of(cell)
     rng = np.random.default_rng(0)
     postures = rng.uniform(limits.lower, limits.upper, (POSTURES, len(cell.axes)))
-    # Two guessed capsules that never keep the least distance are as little worth checking as two
-    # that always touch: each grows by half of that distance.
+    # Two guessed capsules that never keep the least distance are not checked, as two that always
+    # touch: each grows by half of that distance, so that they touch here.
     grown = []
-    for capsule in capsules:
+    for number, capsule in enumerate(capsules):
         radius_m = capsule.radius_m
-        is_guessed = not declared.capsules or capsule.name == PAYLOAD
+        is_guessed = number >= declared_count
         if is_guessed:
             radius_m += 0.5 * declared.minimum_m
         grown.append(replace(capsule, radius_m=radius_m))
@@ -158,9 +177,18 @@ def scene_of(cell: Cell, robot: Robot, mass_kg: float) -> CheckedScene:
     scene = replace(scene_of_all_pairs, pairs=tuple(pairs))
     return CheckedScene(
         checker=Checker(robot, scene),
-        guessed=not declared.capsules,
+        declared=declared_count,
+        payload_link=payload_link,
         together=tuple(together),
     )
+
+
+def _link_name(cell: Cell, robot: Robot, joint: int) -> str:
+    """Return the name that a cell file has for the link behind a joint: that of the axis which
+    drives it, or of the joint where none does.
+    """
+    axis_by_joint = dict(zip(robot.axis_joints, cell.axis_names, strict=True))
+    return axis_by_joint.get(joint, robot.joints[joint].name)
 
 
 def _pairs_of_separate_links(
@@ -305,7 +333,8 @@ class Experiment:
         motor_early = np.abs(train.direction @ early)
         motor_late = np.abs(train.direction @ late)
         motor_moves = np.minimum(motor_early, motor_late) > standstill
-        # Motor i's equation mixes the joints in row i of T; each of them must move.
+        # Motor i's equation mixes the joints in row i of T, and those that turn the motor; each of
+        # them must move.
         is_mixed = np.abs(train.to_motor) > 0
         is_turned = np.abs(train.direction) > 0
         uses = []
@@ -403,7 +432,8 @@ def _effort_remarks(
             refuted.append(name)
     if unknown:
         lines.append(
-            f"torque limits: the URDF has no `effort` of {', '.join(unknown)}; not kept there"
+            f"torque limits: the URDF has no `effort` of {', '.join(unknown)}; their torque is not "
+            "limited"
         )
     if refuted:
         if from_urdf:
@@ -412,8 +442,8 @@ def _effort_remarks(
             masses = "guessed masses of the links"
         lines.append(
             f"torque limits: with {masses}, gravity alone asks more than the `effort` of "
-            f"{', '.join(refuted)} in the URDF; not kept there. Correct `effort` or the masses; "
-            "the planner knows no balancer"
+            f"{', '.join(refuted)} in the URDF; their torque is not limited. Correct `effort` or "
+            "the masses; the planner knows no balancer"
         )
     return tuple(lines)
 
@@ -434,7 +464,7 @@ def _torque_times(path: Trapezoid) -> FloatArray:
     return np.concatenate([*pieces, at_rest])
 
 
-#: Scene without bodies: a checker of it knows the closures of a robot alone
+#: Scene without bodies: its checker checks nothing but the closures of a robot
 EMPTY_SCENE = Scene((), (), (), None, (), 0.0)
 
 
@@ -536,6 +566,8 @@ def experiment_duration_s(cell: Cell, moves: Sequence[PlannedMove]) -> float:
 #: Least duration of the extra moves of each kind, so that the kinds can be compared
 EXTRA_MOVES_S = 5.0
 EXTRA_POSTURES = 300  #: Random postures in which extra moves are tried
+#: The same for a closed chain, for which each posture takes a way of its own
+EXTRA_POSTURES_OF_CHAIN = 20
 SWINGS = 3  #: Most postures in which the extra moves of one kind are made
 SLOW_SHARE = 0.2  #: Share of the speed limit at which gravity excites more than inertia
 STROKES = (1.0, 0.7, 0.4)  #: Shares of the range that are tried until the way is clear
@@ -546,18 +578,18 @@ def extra_moves(experiment: Experiment) -> tuple[ExtraMoves, ...]:
     of everything; the same every time.
 
     For every axis: fast with the arm stretched, fast with it folded (as the payload's link is seen
-    from that axis), slow with it stretched, and fast together with a neighbour; and of all axes
-    together.
+    from that axis), and slow with it stretched; of every two neighbouring axes together; and of all
+    axes together.
     """
     cell = experiment.cell
     checker = experiment.scene.checker
     limits = limits_of(cell)
     low, high = limits.targets()
     rng = np.random.default_rng(0)
-    sampled = rng.uniform(low, high, (EXTRA_POSTURES, len(low)))
     if checker.robot.is_constrained:
-        rng = np.random.default_rng(0)
-        sampled = _allowed(checker, rng, low, high, EXTRA_POSTURES // 15)
+        sampled = _allowed(checker, rng, low, high, EXTRA_POSTURES_OF_CHAIN)
+    else:
+        sampled = rng.uniform(low, high, (EXTRA_POSTURES, len(low)))
     clear = sampled[checker.margins(sampled) > 0.0]
     found: list[ExtraMoves] = []
     ends_of = _swing
@@ -597,11 +629,10 @@ def extra_moves(experiment: Experiment) -> tuple[ExtraMoves, ...]:
         swing(f"fast moves of {name} with the arm stretched", stretched, [axis])
         swing(f"fast moves of {name} with the arm folded", folded, [axis])
         swing(f"slow moves of {name} with the arm stretched", stretched, [axis], SLOW_SHARE)
-        other = axis + 1
-        if other == len(names):
-            other = axis - 1
-        if other >= 0:
-            swing(f"fast moves of {name} and {names[other]} together", clear, [axis, other])
+        following = axis + 1
+        if following < len(names):
+            words = f"fast moves of {name} and {names[following]} together"
+            swing(words, clear, [axis, following])
     swing("fast moves of all axes", clear, list(range(len(names))))
     return tuple(found)
 

@@ -39,6 +39,7 @@ from daq.workflow.choices import (
     LARGEST_STD_PERCENT,
 )
 from daq.workflow.experiment import (
+    PAYLOAD,
     CheckedScene,
     Experiment,
     PlannedMove,
@@ -586,6 +587,11 @@ def _room_remedy(scene: CheckedScene, pair: tuple[str, str]) -> str:
         return f"correct `{pair[1]}` of `clearance.obstacles` in the cell file, or the joint limits"
     if scene.guessed:
         return "the shape of the arm is guessed: declare it in the cell file (`clearance.capsules`)"
+    if scene.payload_link is not None and PAYLOAD in pair:
+        return (
+            "the shape of the payload is guessed: declare a capsule on link "
+            f"{scene.payload_link} in the cell file (`clearance.capsules`)"
+        )
     return (
         "correct these `clearance.capsules` or `clearance.minimum_m` in the cell file, or the "
         "joint limits"

@@ -68,7 +68,8 @@ def read_history_figures(
 ) -> HistoryFigures:
     """Return the figures of a cell's history for the current gains.
 
-    They are `NO_HISTORY` for a cell without one, and, with a warning, where it cannot be read.
+    They are `NO_HISTORY` for a cell without one, and, with a warning, where it cannot be read or is
+    under a new name of the cell.
 
     Args:
         cell: as it is now.
@@ -95,7 +96,8 @@ def read_history_figures(
             cell.name,
             history.renamed.new,
         )
-    digest = sha256(request.signed)  # of the calibration as a file
+        return NO_HISTORY  # what is under the old name since then is of another cell
+    digest = sha256(request.signed)  # of the calibration's file
     return figures_of_history(history, target, digest, changes)
 
 
@@ -111,8 +113,8 @@ def figures_of_history(
        backup was copied back by hand;
     3. 0 if no calibration has it: a person entered it, such as a nameplate.
 
-    The calibration that is judged is left out of the scatter. Its σ counts only if it is in force:
-    otherwise a current gain near to it has another origin.
+    The calibration that is judged is left out of the scatter. As a calibration of the current gain
+    it counts only if it is in force: otherwise that gain is from elsewhere, however near it is.
 
     Args:
         history: of the cell.

@@ -126,7 +126,7 @@ def test_digits_follow_the_uncertainty_and_the_habit_of_the_file(
         ("d: &j {gain: 1.0}\nb: {<<: *j, kp: 1}", "b.gain", "merges (<<)"),
         ("d: &j {gain: 1.0}\nb: {<<: *j, kp: 1}", "d.gain", "shared by an anchor"),
         ("a: {gain: 1.0, kp: 2, gain: 3.0}", "a.gain", "2 times"),
-        ("a: [1.0, 2.0]", "a.2", "no key '2'"),
+        ("a: [1.0, 2.0]", "a.2", "no key '2' in a (it has 0, 1)"),
         ("a: [1.0", "a.0", "no YAML"),
         ("a: 1.0\n---\na: 2.0", "a", "no YAML"),
         ("", "a", "nothing in it"),

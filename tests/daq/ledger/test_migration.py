@@ -292,6 +292,49 @@ def test_a_file_that_is_no_history_is_refused_and_kept(
     assert writers_of(cell_file) == WRITERS
 
 
+@pytest.mark.parametrize(
+    ("table", "column", "value"),
+    [
+        ("calibration", "digest", "x'00'"),
+        ("calibration", "entered", "x'00'"),
+        ("calibration", "document", "x'00'"),
+        ("calibration", "document", "NULL"),
+        ("event", "digest", "x'00'"),
+        ("event", "deed", "x'00'"),
+        ("event", "at", "NULL"),
+        ("event", "who", "7"),
+        ("event", "target", "x'00'"),
+        ("event", "audit", "x'00'"),
+        ("event", "sha256_after", "x'00'"),
+        ("acknowledgement", "axis", "x'00'"),
+        ("acknowledgement", "since", "7"),
+        ("acknowledgement", "at", "x'00'"),
+        ("acknowledgement", "who", "x'00'"),
+        ("acknowledgement", "why", "NULL"),
+        ("acknowledgement", "audit", "NULL"),
+    ],
+)
+def test_a_value_that_is_no_text_is_a_row_of_another_program(
+    cell_file: Path, table: str, column: str, value: str
+) -> None:
+    """Tables of drivegain refuse such a value, those of another program may have it."""
+    path = stored_of(cell_file)
+    columns = {
+        "calibration": "digest, created, entered, document",
+        "event": "number, digest, deed, at, who, target, audit, sha256_after",
+        "acknowledgement": "number, axis, since, at, who, why, audit",
+    }[table]
+    _execute(
+        path,
+        f"CREATE TABLE of_any_type AS SELECT {columns} FROM {table}; "
+        f"DROP TABLE {table}; CREATE TABLE {table} ({columns}); "
+        f"INSERT INTO {table} SELECT * FROM of_any_type; DROP TABLE of_any_type; "
+        f"UPDATE {table} SET {column} = {value}",
+    )
+    with pytest.raises(HistoryUnreadable, match="a row that drivegain did not write: "):
+        read_stored(path)
+
+
 def test_a_sound_file_that_cannot_be_read_now_is_never_put_aside(
     cell_file: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -379,11 +422,17 @@ def test_an_unfinished_transaction_of_a_killed_writer_is_undone_first(cell_file:
         connection.execute("DELETE FROM event")
         os.kill(os.getpid(), signal.SIGKILL)
     os.waitpid(child, 0)
-    assert stored_of(cell_file).with_name("demo.history.sqlite-journal").stat().st_size
+    journal = stored_of(cell_file).with_name("demo.history.sqlite-journal")
+    content = (FILES / "demo.history.sqlite").read_bytes()
+    assert journal.stat().st_size
+    assert stored_of(cell_file).read_bytes() != content
+    # Whatever only reads the history undoes it, too.
+    read_history(ledger_of(cell_file))
+    assert not journal.exists()
+    assert stored_of(cell_file).read_bytes() == content
     assert run_verb("history", cell_file, "--verify") == ExitCode.OK
     assert writers_of(cell_file) == WRITERS
     (aside,) = asides_of(cell_file)
-    content = (FILES / "demo.history.sqlite").read_bytes()
     assert aside.read_bytes() == content
 
 

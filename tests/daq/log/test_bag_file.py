@@ -9,6 +9,7 @@ import os
 import random
 import shutil
 import sqlite3
+import tempfile
 import time
 from collections.abc import Callable
 from contextlib import closing, nullcontext
@@ -34,6 +35,7 @@ from daq.errors import (
     LogForeign,
     LogMissing,
     LogTruncated,
+    OutputFailed,
     TableUnfit,
 )
 from daq.log.bag_file import open_bag
@@ -236,9 +238,15 @@ def test_a_bag_without_the_joints_says_what_it_has(
         read(path, topic=topic)
 
 
-@pytest.mark.parametrize("suffix", ["-wal", "-journal"])
+@pytest.mark.parametrize(
+    ("suffix", "found"),
+    [
+        ("-wal", "messages that are not in the bag yet"),
+        ("-journal", "which undoes a change that was not finished"),
+    ],
+)
 def test_a_database_that_its_recorder_has_not_finished_is_refused(
-    suffix: str, database: Path, tmp_path: Path
+    suffix: str, found: str, database: Path, tmp_path: Path
 ) -> None:
     path = tmp_path / "bag.db3"
     shutil.copyfile(database, path)
@@ -247,13 +255,34 @@ def test_a_database_that_its_recorder_has_not_finished_is_refused(
     assert len(read(path).values) == 60
     rest.write_bytes(b"rows")
     pattern = (
-        rf"found bag\.db3{suffix}, .*; expected a finished bag; "
-        r".*quick_check"
+        rf"found bag\.db3{suffix}, .*{found}; expected a finished bag; "
+        r".*: copy both, and run `sqlite3 bag\.db3 'PRAGMA quick_check'` there"
     )
     with pytest.raises(
         LogTruncated,
         match=pattern,
     ):
+        read(path)
+
+
+@pytest.mark.parametrize("packed_suffix", [".zstd", ".zst"])
+@pytest.mark.parametrize("suffix", ["-wal", "-journal"])
+def test_a_database_that_was_packed_before_its_recorder_finished_it_is_refused(
+    suffix: str, packed_suffix: str, database: Path, tmp_path: Path
+) -> None:
+    """SQLite has named its log before the file was packed."""
+    path = tmp_path / f"bag.db3{packed_suffix}"
+    content = zstandard.compress(database.read_bytes())
+    path.write_bytes(content)
+    assert len(read(path).values) == 60
+    rest = tmp_path / f"bag.db3{suffix}"
+    rest.write_bytes(b"rows")
+    pattern = (
+        rf"found bag\.db3{suffix}, .*; expected a finished bag; "
+        rf".*: copy both, unpack the copy \(`zstd -d bag\.db3{packed_suffix} -o bag\.db3`\), and "
+        r"run `sqlite3 bag\.db3 'PRAGMA quick_check'` there"
+    )
+    with pytest.raises(LogTruncated, match=pattern):
         read(path)
 
 
@@ -280,7 +309,8 @@ def test_a_bomb_is_not_unpacked(tmp_path: Path) -> None:
     content = zstandard.compress(bytes(2**28))
     path.write_bytes(content)
     with pytest.raises(
-        LogCorrupt, match="unfolds to 200 times its size; expected a recording, packed by zstd"
+        LogCorrupt,
+        match="unfolds to more than 200 times its size; expected a recording, packed by zstd",
     ):
         read(path)
     with pytest.raises(ValueError, match="bytes that unfold to 268435456"):
@@ -347,6 +377,21 @@ def test_a_packed_file_that_cannot_be_read_is_named_not_the_room_for_its_content
         pytest.raises(LogMissing, match=r"bag\.mcap\.zstd: found input/output error; .* zstd"),
         open_bag(path),
     ):
+        pass
+
+
+def test_no_folder_for_what_a_file_unfolds_to_is_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "bag.mcap.zstd"
+    path.write_bytes(zstandard.compress(bytes(1000)))
+    missing = tmp_path / "missing"
+    monkeypatch.setattr(tempfile, "tempdir", str(missing))
+    pattern = (
+        r"folder for temporary files: found no such file or directory; expected room for what "
+        r"bag\.mcap\.zstd unfolds to; .*TMPDIR"
+    )
+    with pytest.raises(OutputFailed, match=pattern), open_bag(path):
         pass
 
 

@@ -200,6 +200,27 @@ def test_the_damaged_end_of_a_finished_log_is_left_out(tmp_path: Path, checkout:
     assert "checksum" in saved.damage
 
 
+def test_damage_is_described_where_the_recording_is_cut_and_not_where_its_summary_is(
+    tmp_path: Path, checkout: Path
+) -> None:
+    path = write(tmp_path / "whole.mcap", demo_content(checkout), ROWS)
+    reader = LogReader(path)
+    list(reader.until_damage())
+    end_of_records = reader.whole_bytes
+    content = path.read_bytes()
+    # The closing mark is behind these bytes: this file ends between two records.
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(content[:end_of_records])
+    saved_of_cut = salvage(cut, tmp_path / "saved-cut.mcap")
+    assert saved_of_cut.statistics.samples == len(ROWS)
+    assert saved_of_cut.damage.startswith(f"{cut}: {end_of_records} bytes without the closing mark")
+    without_summary = tmp_path / "without-summary.mcap"
+    without_summary.write_bytes(content[:-20])
+    saved = salvage(without_summary, tmp_path / "saved.mcap")
+    assert saved.statistics.samples == len(ROWS)
+    assert (saved.damage, saved.left_out_bytes) == ("", 0)
+
+
 def test_a_whole_log_needs_no_salvage(tmp_path: Path, checkout: Path) -> None:
     path = tmp_path / "whole.mcap"
     damaged = write(path, demo_content(checkout), ROWS[:5])

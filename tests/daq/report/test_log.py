@@ -1,11 +1,14 @@
-"""Time stamps of an import in a sentence."""
+"""Time stamps of an import in a sentence, and the report of its held-out part."""
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
-from daq.log.metadata import Timing
-from daq.report.log import timing_text
+from daq.log.importing import Imported
+from daq.log.metadata import RunStatistics, Timing
+from daq.report.log import import_report, timing_text
 
 
 @pytest.mark.parametrize(
@@ -33,3 +36,14 @@ def test_time_stamps_are_told_without_exponents(rate_hz: float, jitter_s: float,
     )
     text = timing_text(timing)
     assert text.startswith(says)
+
+
+def test_a_held_out_part_without_the_path_of_its_log_is_refused() -> None:
+    statistics = RunStatistics(100, 0, (0,), valid=True, reason="")
+    imported = Imported(statistics, None, (), holdout=statistics)
+    log = Path("log.mcap")
+    report = import_report(log, imported, Path("held-out.mcap"))
+    assert report.holdout is not None
+    assert report.holdout.log == "held-out.mcap"
+    with pytest.raises(ValueError, match="no path of the log of the held-out part"):
+        import_report(log, imported, None)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ from daq.config.cell import Cell
 from daq.config.cell_file import load_cell
 from daq.config.workspace import Clearance
 from daq.errors import ConfigurationInconsistent, PlanTooShort, UsageError
-from daq.workflow.experiment import Experiment, experiment_of, paths_of
+from daq.workflow.experiment import Experiment, experiment_of, extra_moves, paths_of
 from daq.workflow.plan import LONGEST_S, Plan, longer_run_s, nearly_right_joints, plan, slowed
 from drivers.move import Trapezoid
 from ident.planning.clearance import BASE, Box, Capsule
@@ -325,6 +326,18 @@ def test_two_declared_bodies_that_are_always_too_close_are_named(demo: Cell) -> 
     assert "workspace" not in refused.value.remedy
 
 
+def test_a_guessed_payload_that_is_often_too_close_is_to_be_declared(demo: Cell) -> None:
+    """It is the only body that the cell file does not have."""
+    column = Capsule("column", BASE, (0.0, 0.0, 0.0), (0.0, 0.0, 0.4), 0.35)
+    clearance = Clearance(None, 0.1, (column,), ())
+    crowded = replace(demo, clearance=clearance)
+    with pytest.raises(UsageError, match=r"column and payload are at most") as refused:
+        plan(crowded, seed=1)
+    assert "the shape of the payload is guessed: declare a capsule on link J6" in (
+        refused.value.remedy
+    )
+
+
 def test_an_obstacle_around_the_arm_is_named(demo: Cell) -> None:
     lower_m = (-2.0, -2.0, -2.0)
     upper_m = (2.0, 2.0, 2.0)
@@ -345,3 +358,13 @@ def test_guessed_bodies_that_never_keep_the_distance_belong_together(demo: Cell)
     assert set(scene.together) < set(closer.together)
     moves = plan(near, seed=1, duration_s=30.0, exchanges=0).moves
     assert len(moves) >= 5
+
+
+def test_each_two_neighbouring_axes_are_tried_together_once(experiment: Experiment) -> None:
+    """The same two in the other order would make the same moves."""
+    extras = extra_moves(experiment)
+    together = [extra.words for extra in extras if extra.words.endswith("together")]
+    names = experiment.cell.axis_names
+    assert together == [
+        f"fast moves of {first} and {second} together" for first, second in pairwise(names)
+    ]

@@ -51,7 +51,45 @@ def test_what_is_declared_is_what_is_checked(cell_file: Path) -> None:
     assert (scene.minimum_m, scene.confined, scene.boxes[0].name) == (0.03, (2,), "table")
     assert {(0, 1), (0, 2)} <= set(scene.pairs)
     assert scene.workspace is not None
-    assert "as declared" in found.remarks[0]
+    assert found.remarks[0] == "shape of the arm: 3 capsules, as declared"
+    assert not any("payload" in line for line in found.remarks)
+
+
+def test_a_payload_without_a_declared_capsule_is_said_to_be_guessed(cell_file: Path) -> None:
+    lines = [line for line in DECLARED.splitlines() if "name: disc" not in line]
+    cell_file.write_text(cell_file.read_text() + "\n".join(lines))
+    cell = load_cell(cell_file)
+    robot = model_of(cell).robot
+    found = scene_of(cell, robot, 4.59)
+    names = [capsule.name for capsule in found.checker.scene.capsules]
+    assert names == ["column", "forearm", "payload"]
+    assert not found.guessed
+    assert found.remarks[:2] == (
+        "shape of the arm: 2 capsules, as declared",
+        "shape of the payload: guessed from its mass; declare a capsule on link J6 in "
+        "`clearance.capsules` of the cell file",
+    )
+
+
+@pytest.mark.parametrize("name", ["hub", "payload"])
+def test_the_name_of_a_declared_capsule_does_not_change_what_is_checked(
+    cell_file: Path, name: str
+) -> None:
+    """The hub turns about the shoulder, 10 mm above the column in every posture."""
+    capsules = f"""
+clearance:
+  minimum_m: 0.03
+  capsules:
+    - {{name: column, link: base, from_m: [0, 0, 0], to_m: [0, 0, 0.21], radius_m: 0.05}}
+    - {{name: {name}, link: J2, from_m: [0, 0, -0.01], to_m: [0, 0, 0.01], radius_m: 0.05}}
+    - {{name: disc, link: J6, from_m: [0, 0, 0.08], to_m: [0, 0, 0.12], radius_m: 0.1}}
+"""
+    cell_file.write_text(cell_file.read_text() + capsules)
+    cell = load_cell(cell_file)
+    robot = model_of(cell).robot
+    found = scene_of(cell, robot, 4.59)
+    assert found.together == ()
+    assert (0, 1) in found.checker.scene.pairs
 
 
 @pytest.mark.parametrize(
