@@ -43,7 +43,7 @@ help:
 	@echo "make crash-study  recorders killed at random moments, damaged logs; some minutes"
 	@echo "make kill-study  jobs killed at 60 random moments, each finished by the next one; some minutes"
 	@echo "make session-kill-study  guided sessions killed at 40 random moments of all stages, each finished by the same command; resumable, some minutes"
-	@echo "make write-fault-study  kills, errors and short writes at every changing system call of apply, rollback, recalibrate and calibrate (docs/evidence/write-path.md); VERBS=\"apply calibrate\" EVERY=3 MINUTES=20; resumable, an hour"
+	@echo "make write-fault-study  kills, errors and short writes at every changing system call of apply, rollback, recalibrate and calibrate (docs/evidence/write-path.md); VERBS=\"apply calibrate\" EVERY=3 MINUTES=20; resumable, three hours"
 	@echo "make guard-study  the axes of a recorder killed by kill -9, with a foreign node on every id from 1 to 127; minutes"
 	@echo "make console-study  60 minutes on SocketCAN with the console alternately open and closed: losses, jitter, processor, memory"
 	@echo "make soak    recordings at rising rates with the console open and screens stalled: what the host lost, and what drivegain lost (docs/evidence/stream.md); MINUTES=60 REALTIME=1; resumable, more than an hour"
