@@ -1,9 +1,10 @@
 """What lets a recorder send SYNC on time: no long search for garbage, threads that give way soon,
-and real-time priority.
+memory that stays, and real-time priority.
 """
 
 from __future__ import annotations
 
+import ctypes
 import gc
 import os
 import sys
@@ -12,12 +13,15 @@ from contextlib import contextmanager, suppress
 
 NEVER = 2**31 - 1  #: Searches of the middle generation before one of everything
 SWITCH_S = 0.0005  #: Time after which a thread gives way to one that waits; Python's own is 5 ms
+#: mlockall(2): all that the process has mapped now, each page from when it is first used
+MCL_CURRENT = 1
+MCL_ONFAULT = 4
 
 
 @contextmanager
 def on_time() -> Iterator[None]:
     """Let the calling thread be on time while the block runs: all of the below."""
-    with defer_full_gc(), switch_threads_soon(), real_time_priority():
+    with defer_full_gc(), switch_threads_soon(), memory_stays(), real_time_priority():
         yield
 
 
@@ -54,6 +58,27 @@ def switch_threads_soon() -> Iterator[None]:
         yield
     finally:
         sys.setswitchinterval(before_s)
+
+
+@contextmanager
+def memory_stays() -> Iterator[None]:
+    """Let the kernel take no page of the program away, where that is permitted.
+
+    Under pressure, or where it reclaims what has not been used for a while, the kernel drops pages
+    of a program and reads them again from the disk when they are needed. The thread that needs them
+    waits for the disk, whatever its priority, and so does every thread that waits for it.
+
+    Only what is mapped now is kept: with what comes later (MCL_FUTURE), a limit that is nearly
+    reached would make an allocation fail in the run.
+    """
+    libc = ctypes.CDLL(None)
+    # Without the right to it (CAP_IPC_LOCK, or a limit memlock that is large enough), it changes
+    # nothing.
+    libc.mlockall(MCL_CURRENT | MCL_ONFAULT)
+    try:
+        yield
+    finally:
+        libc.munlockall()
 
 
 @contextmanager

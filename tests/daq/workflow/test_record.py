@@ -8,6 +8,7 @@ import gc
 import io
 import json
 import os
+import resource
 import sys
 import threading
 from collections.abc import Callable, Iterable
@@ -465,6 +466,25 @@ def test_the_second_block_of_a_session_has_real_time_priority_too() -> None:
         with real_time_priority():
             policies.append(_policy())
     assert policies == [os.SCHED_RR, os.SCHED_RR]
+
+
+def _kept_kib() -> int:
+    """Memory of this process that the kernel may not take away [KiB]."""
+    status = Path("/proc/self/status").read_text(encoding="ascii")
+    (line,) = [line for line in status.splitlines() if line.startswith("VmLck")]
+    return int(line.split()[1])
+
+
+def test_memory_of_a_recorder_stays_while_it_records(lockstep: Rig) -> None:
+    soft_limit, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
+    if os.geteuid() != 0 and soft_limit != resource.RLIM_INFINITY:
+        pytest.skip("this user may not keep memory (CAP_IPC_LOCK, or a limit memlock)")
+    before_kib = _kept_kib()
+    found_kib = []
+    lockstep.bus.on_cycle = lambda _cycle: found_kib.append(_kept_kib())
+    lockstep.run()
+    assert min(found_kib) > before_kib + 10_000
+    assert _kept_kib() == before_kib
 
 
 def test_a_disk_that_takes_nothing_for_200_cycles_costs_none_of_them(
