@@ -589,10 +589,12 @@ def _no_file(path: Path, found: str) -> AuditUnusable:
 
 
 def digest_now(subject: str) -> str | None:
-    """Return the SHA-256 of a file as it is now, `GONE` without one,
-    None where it cannot be read.
+    """Return the SHA-256 of a file as it is now, `GONE` without one, None where it cannot be read,
+    and for drives: their subject is a name, and they are on a bus.
     """
     path = Path(subject)
+    if not path.is_absolute():
+        return None
     try:
         return sha256_of(path) if path.exists() else GONE
     except OSError:

@@ -295,20 +295,24 @@ class DriveTarget:
         whole or cut off by a kill.
 
         Raises:
-            CalibrationRefused: there is no record of such a write.
+            CalibrationRefused: there is no record of such a write; or the drives have the gains
+                from before the last one, so that nothing of it needs to be undone.
             ControllerUnfit: its record was changed, or is of another cell.
             ControllerChanged: a drive was exchanged, or a gain was changed since.
             DriverError: see `drivers.canopen.parameters.read_parameters`.
         """
         folder = record_folder(self.cell)
         paths = read_records(folder)
-        for path in reversed(paths):
+        for place in reversed(range(len(paths))):
+            path = paths[place]
             record = read_record(path)
             current = read_parameters(self.network, self._recorded_parameters(path, record))
-            # Nothing to undo: the writer was killed before its first write, or the write was rolled
-            # back.
             if _has_previous_gains(current, record):
-                continue
+                if not _changes_gains(record) or _is_rollback(record, paths[:place]):
+                    # Drives that saved what they had; or a rollback that was not made: this one
+                    # makes it.
+                    continue
+                raise _not_in_drives(self.subject, path, record)
             _check_untouched(path, record, current)
             writes = []
             for value, note in zip(current, record.drives, strict=True):
@@ -556,6 +560,36 @@ def _has_previous_gains(current: tuple[ParameterValue, ...], record: DriveRecord
     """Whether every drive has the gain that it had before a recorded write."""
     pairs = zip(current, record.drives, strict=True)
     return all(value.word == note.old for value, note in pairs)
+
+
+def _changes_gains(record: DriveRecord) -> bool:
+    """Whether a recorded write was to change the gain of any drive."""
+    return any(note.old != note.new for note in record.drives)
+
+
+def _is_rollback(record: DriveRecord, earlier: tuple[Path, ...]) -> bool:
+    """Whether a recorded write was to undo one of the earlier writes.
+
+    Raises:
+        ControllerUnfit: an earlier record cannot be read, or was changed.
+    """
+    undone = []
+    for note in record.drives:
+        undone.append(note.model_copy(update={"old": note.new, "new": note.old}))
+    return any(read_record(path).drives == tuple(undone) for path in earlier)
+
+
+def _not_in_drives(subject: str, path: Path, record: DriveRecord) -> CalibrationRefused:
+    """Return the error for the rollback of a write that the drives do not have."""
+    return CalibrationRefused(
+        subject,
+        found=f"the gains from before the last write, begun by {record.who} at {record.at}: that "
+        "write was not made, was taken back, or was not saved",
+        expected="a write to take back",
+        remedy="nothing was written, and nothing needs to be undone; to take back the write before "
+        f"it all the same, apply the calibration of that time again ({path.parent} has the "
+        "previous gains of each write)",
+    )
 
 
 def _check_untouched(path: Path, record: DriveRecord, current: tuple[ParameterValue, ...]) -> None:

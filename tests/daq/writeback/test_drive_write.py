@@ -25,15 +25,18 @@ from daq.errors import (
     ControllerUnfit,
     OutputFailed,
 )
-from daq.ledger.audit import AuditAction, read, verify
+from daq.ledger.audit import AuditAction, Content, read, verify
 from daq.ledger.ledger import Ledger, acknowledge, plan_rename, read_history, rename_cell
 from daq.ledger.names import drives_of
 from daq.writeback.drive_target import (
     DriveEdit,
+    DriveNote,
+    DriveRecord,
     DriveTarget,
     read_record,
     read_records,
     record_folder,
+    write_record,
 )
 from daq.writeback.gates.gate import Gate
 from daq.writeback.request import Request
@@ -889,14 +892,64 @@ def test_after_a_kill_the_record_says_what_was_there_and_leads_back(
         assert old_gains == IN_DRIVES
         (left,) = verify(cell.history.audit).open_writes
         assert left.begun.action is AuditAction.APPLY_BEGUN
+        # The audit log sees no drive: it does not say that they have neither gain.
+        assert left.content is Content.UNKNOWN
         with network_of(cell, hub.address()) as network:
             if writes:
                 rollback(DriveTarget(cell, network), NOW)
             else:
-                with pytest.raises(CalibrationRefused, match="1 record of the current gains"):
+                with pytest.raises(CalibrationRefused, match="nothing needs to be undone"):
                     rollback(DriveTarget(cell, network), NOW)
         assert _gains(simulation) == IN_DRIVES
         assert _saved(simulation) == IN_DRIVES
+
+
+def test_a_rollback_behind_a_write_that_was_not_made_leaves_the_write_before(
+    address: BusAddress, tmp_path: Path
+) -> None:
+    """A cut cable, or a kill before the first drive, leaves a record and the gains before it."""
+    cell = demo_cell(tmp_path)
+    with simulated(address) as simulation:
+        _write(cell, address)
+        record_without_write = _record_of_higher_gains(_last_record(cell))
+        write_record(record_folder(cell), cell.name, NOW, "T", record_without_write)
+        with (
+            network_of(cell, address) as network,
+            pytest.raises(CalibrationRefused, match="begun by T at .*nothing needs to be undone"),
+        ):
+            rollback(DriveTarget(cell, network), NOW)
+        assert _gains(simulation) == NEW
+        assert _saved(simulation) == NEW
+
+
+def test_a_rollback_that_was_not_made_is_made_by_the_next_one(
+    address: BusAddress, tmp_path: Path
+) -> None:
+    cell = demo_cell(tmp_path)
+    with simulated(address) as simulation:
+        _write(cell, address)
+        way_back = []
+        for note in _last_record(cell).drives:
+            way_back.append(note.model_copy(update={"old": note.new, "new": note.old}))
+        write_record(record_folder(cell), cell.name, NOW, "T", tuple(way_back))
+        with network_of(cell, address) as network:
+            rollback(DriveTarget(cell, network), NOW)
+        assert _gains(simulation) == IN_DRIVES
+        assert _saved(simulation) == IN_DRIVES
+
+
+def _last_record(cell: Cell) -> DriveRecord:
+    *_, newest = read_records(record_folder(cell))
+    return read_record(newest)
+
+
+def _record_of_higher_gains(record: DriveRecord) -> tuple[DriveNote, ...]:
+    """What the record of a next write says, to gains one unit above those that are written."""
+    drives = []
+    for note in record.drives:
+        higher = {"old": note.new, "new": note.new + 1}
+        drives.append(note.model_copy(update=higher))
+    return tuple(drives)
 
 
 def _write_until_killed(folder: Path, address: BusAddress, writes: int) -> None:
