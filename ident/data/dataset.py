@@ -90,7 +90,7 @@ class Dataset:
     current_a: FloatArray  #: of the motors, as recorded
     moving: BoolArray  #: joint faster than its standstill speed
     motor_moving: BoolArray  #: motor faster than its joint's standstill speed times the reduction
-    valid: BoolArray  #: sample may be used
+    valid: BoolArray  #: position of joint i and current of motor i may be used
     #: number of the move of each sample, shape (k,); one longer than LONGEST_MOVE_S counts as
     #: several
     move: IntArray

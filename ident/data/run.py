@@ -72,7 +72,7 @@ class Run:
     move: IntArray | None = None
     digest: str = ""  #: of the log it was read from (sha256, hex)
     #: Whether each sample may be used, shape (k, n): False where a frame was missing or a limit
-    #: acted.
+    #: acted. A flag is of the position of axis i and of the current of motor i.
     valid: BoolArray | None = None
     #: When the run began, on a clock that the runs of one session share [s]; None without a clock.
     started_s: float | None = None

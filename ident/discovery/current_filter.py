@@ -101,6 +101,11 @@ def find_current_filter(evidence: Evidence) -> CurrentFilter | None:
     if _fast_slope(evidence) >= SLOPE:
         return None
     try:
+        if not evidence.estimate.method.is_of_currents:
+            # Errors of currents are judged in units of their own noise [A], which the other
+            # estimators lack; what is fitted below is fitted by ml anyway.
+            by_likelihood, _ = _estimate(evidence, evidence.training)
+            evidence = replace(evidence, estimate=by_likelihood)
         chosen = _chosen(_Trials(evidence))
         if chosen is None:
             return None

@@ -157,7 +157,7 @@ class Currents:
         for _ in range(ROUNDS):
             parameters = self.whitened(gains, noise).parameters(gains)
             updated = self.noise(gains, parameters, free, noise)
-            if np.allclose(updated, noise, rtol=SETTLED):
+            if np.allclose(updated, noise, rtol=SETTLED, atol=0.0):
                 break
             noise = updated
         return parameters, noise
@@ -258,7 +258,7 @@ class PreloadedCurrents(Currents):
             for _ in range(ROUNDS):
                 before = noise
                 noise = self.noise(gains, parameters, free, noise)
-                if np.allclose(before, noise, rtol=SETTLED):
+                if np.allclose(before, noise, rtol=SETTLED, atol=0.0):
                     break
             return noise
         whitened = self.whitened(gains, before)

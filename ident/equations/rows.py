@@ -97,6 +97,9 @@ def row_masks(
     A joint that turns back rests for a moment only, and its friction turns with it. Samples that
     are not valid do no harm there: their positions are known.
 
+    A flag of `Dataset.valid` is of an axis: of the position of joint i, and of the current of
+    motor i, which is in the equations of all joints that it turns.
+
     Preload joins the equations of all motors: of a redundant drive, rows count in which all of them
     move.
     """
@@ -121,12 +124,19 @@ def row_masks(
     motor_use = np.empty_like(use)
     for motor, still in enumerate(motor_still):
         joints = is_mixed[motor] | is_turned[motor]
-        motor_use[motor] = use[joints].all(axis=0) & ~still
+        is_wrong = invalid_share[motor] > 0.0
+        motor_use[motor] = use[joints].all(axis=0) & ~still & ~is_wrong
     # A coupled motor that sticks leaves an undetermined torque in the equations of all joints it
     # turns with.
     for motor in drive_train.coupled:
         stuck = is_turned[motor][:, None] & motor_still[motor][None, :]
         use &= ~stuck
+    # Row j is Y_j = Σ_i r_ij g_i v_i: a current that is wrong spoils the rows of all joints that
+    # its motor turns.
+    for motor, turned in enumerate(is_turned):
+        is_wrong = invalid_share[motor] > 0.0
+        spoiled = turned[:, None] & is_wrong[None, :]
+        use &= ~spoiled
     if model.is_redundant:
         all_move = use.all(axis=0) & motor_use.all(axis=0)
         use[:] = all_move

@@ -9,7 +9,7 @@ import numpy as np
 
 from ident.arrays import FloatArray, IntArray
 from ident.equations.currents import Currents, PreloadedCurrents
-from ident.equations.triangles import Triangles, singular_values, solve, triangle
+from ident.equations.triangles import Triangles, qr_update, singular_values, solve, triangle
 from ident.errors import DataUnfit, PayloadMissing, RankDeficient
 from ident.model.base import BaseParameters, base_parameters
 from ident.model.bodies import LINK_PARAMETERS, LINK_UNITS, Payload
@@ -249,7 +249,7 @@ class System(Equations):
         count = len(seen)
         stacked = np.concatenate((instruments[:, seen], columns), axis=1)
         # R of [Z | W]: its upper rows hold R_Z and what Z explains of W.
-        upper = triangle((stacked,), stacked.shape[1])[:count]
+        upper = qr_update(None, stacked.T)[:count]
         coefficients, _ = solve(upper[:, :count], upper[:, count:])
         projected: list[FloatArray] = []
         for cluster, own_instruments in zip(self.clusters, self.instruments, strict=True):

@@ -63,6 +63,9 @@ class Triangles:
 def triangle(parts: Iterable[FloatArray], columns: int) -> FloatArray:
     """R of rows that come in pieces below each other, shape (≤columns, columns).
 
+    As few rows as columns, or fewer, stay as they are: ‖R x‖ = ‖W x‖ holds, but R is no triangle.
+    Whoever needs one calls `qr_update`.
+
     It is made block by block (`qr_update`): LAPACK's factorisation of all rows at once goes through
     the memory for every few columns, and takes three to five times as long.
 
@@ -125,7 +128,7 @@ def least_squares(matrix: FloatArray, right: FloatArray) -> FloatArray:
         solution, _ = solve(matrix, right)
         return solution
     rows = np.column_stack((matrix / norms, right))
-    factor = triangle((rows,), columns + 1)
+    factor = qr_update(None, rows.T)
     upper = factor[:columns, :columns]
     reciprocal_condition, _ = lapack.dtrcon(upper)
     if reciprocal_condition < LEAST_RECIPROCAL_CONDITION:

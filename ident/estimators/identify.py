@@ -150,7 +150,9 @@ def identify(
     rows = [rows_of_run for _, rows_of_run in kept]
     observation = observe(model, datasets, conditioning, system, rows)
     found = replace(found, gathered=(datasets, observation))
-    limits = limited_currents(observation, estimate)
+    # Limits may take samples of held-out runs out, but held-out runs decide nothing of the fit.
+    is_of_fit = observation.run < len(channels)
+    limits = limited_currents(observation.only(is_of_fit), estimate)
     if not limits:
         return found
     return _without_limited_currents(found, datasets, limits, known_gains)

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 from scipy import signal
 
@@ -20,7 +21,7 @@ from ident.discovery.current_filter import CurrentFilter, find_current_filter
 from ident.discovery.evidence import gather
 from ident.estimators.identify import identify
 from ident.estimators.method import Method
-from tests.ident.mistaken import small_recordings
+from tests.ident.mistaken import SMALL, small_recordings
 from tests.ident.recordings import Truth, acting_on, bent, gathered, three_axes_truth
 from tests.studies.real_runs import RECORDINGS
 
@@ -82,6 +83,27 @@ def test_gains_behind_a_filter_are_right_once_it_is_in_the_model() -> None:
     assert np.all(np.abs(filtered.gains - TRUTH.gains) < 4.0 * filtered.gains_std)
     bare = np.abs(evidence.estimate.gains / TRUTH.gains - 1.0)
     assert error.max() < bare.max()
+
+
+@pytest.mark.slow
+def test_a_filter_is_judged_in_the_noise_of_the_currents_by_any_estimator() -> None:
+    runs = _recorded(lambda run: without_phase(run, 2.0, 2))
+    found: list[CurrentFilter] = []
+    for method in (Method.ML, Method.WLS):
+        fitted = identify(
+            TRUTH.model,
+            runs,
+            SMALL,
+            method=method,
+            fixed_gains=TRUTH.gains,
+            keep_rows=True,
+            judge=False,
+        )
+        current_filter = find_current_filter(gather(fitted))
+        assert current_filter is not None
+        found.append(current_filter)
+    by_ml, by_wls = found
+    assert_allclose(by_wls.change.before, by_ml.change.before, rtol=1e-6)
 
 
 @pytest.mark.parametrize("seed", [3, 4])

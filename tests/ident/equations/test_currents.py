@@ -4,6 +4,8 @@ against their definition and against finite differences.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -85,6 +87,16 @@ def test_the_noise_of_each_current_is_found_with_its_degrees_of_freedom(
     rows_root = np.sqrt(ROWS - 5 / 3)
     expected = np.linalg.norm(errors, axis=1) / rows_root
     assert_allclose(currents.noise(GAINS, PARAMETERS, free=5), expected, rtol=1e-10)
+
+
+def test_the_unit_of_the_currents_changes_no_parameter(recording: Recording) -> None:
+    unit = 1e-7
+    currents = recording.currents()
+    in_other_unit = replace(currents, drive=unit * currents.drive)
+    parameters, noise = currents.settled(GAINS, free=5)
+    found, found_noise = in_other_unit.settled(GAINS / unit, free=5)
+    assert_allclose(found, parameters, rtol=1e-8)
+    assert_allclose(found_noise, unit * noise, rtol=1e-8)
 
 
 def test_a_motor_without_rows_has_a_noise_of_one(recording: Recording) -> None:

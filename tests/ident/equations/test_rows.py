@@ -14,6 +14,7 @@ from ident.data.dataset import Dataset, differentiate
 from ident.data.run import Run
 from ident.equations.rows import at_rows, chunks, motor_columns, row_filter, row_masks
 from ident.errors import DataUnfit
+from ident.model.model import DriveTrain
 from tests.ident.recordings import CONDITIONING, Truth
 
 SMALL = replace(CONDITIONING, standstill_rad_s=CONDITIONING.standstill_rad_s[:3])
@@ -72,6 +73,51 @@ def test_one_invalid_sample_takes_every_row_whose_window_has_it(
     assert np.array_equal(use[1][~seen], usable[1][~seen])
     assert np.array_equal(use[0], usable[0])
     assert not motor_use[1][seen].any()
+
+
+def _masks_of_gears(
+    truth: Truth, data: Dataset, ratio: FloatArray, axis: int
+) -> tuple[BoolArray, BoolArray, BoolArray]:
+    """Masks of an arm with these gears that always moves, where an axis has a stretch that is not
+    valid, and the rows that see the stretch.
+    """
+    model = replace(truth.model, drive_train=DriveTrain(ratio))
+    everywhere = np.ones_like(data.valid)
+    moving = replace(data, valid=everywhere, moving=everywhere, motor_moving=everywhere)
+    valid = everywhere.copy()
+    valid[2000:2500, axis] = False
+    weights, windows = _windows(data)
+    seen = _share(weights, windows, ~valid[:, axis]) > 0.0
+    use, motor_use = row_masks(model, replace(moving, valid=valid), SMALL)
+    return use, motor_use, seen
+
+
+def test_a_wrong_current_of_a_coupled_motor_takes_the_rows_of_all_joints_that_it_turns(
+    small_truth: Truth, data: Dataset
+) -> None:
+    ratio = np.diag([40.0, 50.0, 45.0])
+    ratio[2, 1] = 45.0  # motor 3 turns joints 2 and 3
+    use, motor_use, seen = _masks_of_gears(small_truth, data, ratio, axis=2)
+    assert seen.any()
+    assert use[0].all()
+    assert np.array_equal(use[1], ~seen)
+    assert np.array_equal(use[2], ~seen)
+    assert not motor_use[2][seen].any()
+    assert motor_use[0].all()
+
+
+def test_a_wrong_current_of_a_motor_that_drives_another_joint_takes_the_rows_of_that_joint(
+    small_truth: Truth, data: Dataset
+) -> None:
+    ratio = np.diag([0.0, 0.0, 45.0])
+    ratio[0, 1] = 50.0
+    ratio[1, 0] = 40.0
+    use, motor_use, seen = _masks_of_gears(small_truth, data, ratio, axis=0)
+    assert seen.any()
+    assert not motor_use[0][seen].any()
+    assert not use[1][seen].any()
+    assert use[2].all()
+    assert motor_use[2].all()
 
 
 def test_a_motor_at_rest_has_no_row_while_its_joint_moves(

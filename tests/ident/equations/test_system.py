@@ -163,3 +163,19 @@ def test_equal_columns_are_named(system: System) -> None:
     lost = str(caught.value)
     names = [column.name for column in system.unknowns[:2]]
     assert any(name in lost for name in names)
+
+
+def test_instruments_explain_the_columns_as_least_squares_do_by_few_rows(system: System) -> None:
+    """With more rows than unknowns, but fewer than unknowns and instruments together."""
+    rng = np.random.default_rng(7)
+    axes = system.axis_count
+    unknowns = len(system.unknowns)
+    rows = unknowns + 5
+    cluster = tuple(rng.normal(size=(rows, unknowns + 2)) for _ in range(axes))
+    instruments = tuple(rng.normal(size=(rows, 30)) for _ in range(axes))
+    few = replace(system, clusters=(cluster,), instruments=(instruments,))
+    (projected,) = few.on_instruments().clusters
+    for own, own_instruments, found in zip(cluster, instruments, projected, strict=True):
+        coefficients, *_ = np.linalg.lstsq(own_instruments, own[:, 1:], rcond=None)
+        assert_allclose(found[:, 0], own[:, 0])
+        assert_allclose(found[:, 1:], own_instruments @ coefficients, atol=1e-9)

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
@@ -139,6 +139,8 @@ def test_of_two_equal_columns_each_gets_half() -> None:
     assert_allclose(solution, [3.0, 3.0], rtol=1e-9)
 
 
+@example(rows=4, columns=3, spread=0.0, seed=1)
+@example(rows=2, columns=1, spread=0.0, seed=1)
 @given(
     rows=st.integers(1, 60),
     columns=st.integers(1, 8),

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from ident.data.run import Run
 from ident.errors import Diagnosis
@@ -109,3 +110,15 @@ def test_a_motor_that_weakens_is_no_limit(runs: list[Run]) -> None:
         current[:, AXIS] *= 1.0 + (current[:, AXIS] / half_a) ** 2
         weak.append(replace(run, current_a=current))
     assert limits_named(fitted(weak)) == []
+
+
+def test_a_held_out_run_decides_no_sample_of_the_fit(runs: list[Run]) -> None:
+    """A limit that shows in the held-out run alone, at currents that the others reach."""
+    limit_a = 0.95 * largest_a([runs[3]])
+    held_out = replace(winding_up(runs[3], limit_a), name="held out")
+    bare, loaded, other_bare, _ = runs
+    used = [bare, loaded, other_bare]
+    found = identify(TRUTH.model, used, SMALL, axes=AXES, holdout=[held_out], keep_rows=True)
+    alone = identify(TRUTH.model, used, SMALL, axes=AXES, keep_rows=True)
+    assert_allclose(found.estimate.gains, alone.estimate.gains, rtol=1e-12)
+    assert np.isnan(found.channels[0].torque_limits).all()
