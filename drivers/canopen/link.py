@@ -301,6 +301,11 @@ class Link:
         self._beat = base_frame(HEARTBEAT + node_id, bytes((NmtState.OPERATIONAL,)))
         self._beat_period_ns, self._next_beat_ns = period_ms * 1_000_000, self.clock()
 
+    @property
+    def sends_heartbeat(self) -> bool:
+        """Whether the recorder's heartbeat is sent now."""
+        return self._beat is not None
+
     def stop_heartbeat(self) -> None:
         """Send no heartbeat any more."""
         self._beat = None

@@ -640,6 +640,20 @@ class CanopenNetwork:
             access.write(CONTROLWORD, next_command(state, goal))
             self.link.pass_time()
 
+    def _keep_watch(self, axis: Axis, problems: Sequence[DriverError]) -> None:
+        """Let an amplifier that could not be disabled go on watching the recorder.
+
+        Its heartbeat ends with the network: this is what may still stop the axis.
+        """
+        guard = self._setups[axis.node_id].guard
+        if axis.node_id in self.powered and guard.watching and self.link.sends_heartbeat:
+            guard.stays = True
+            problems[-1].add_note(
+                f"{WHILE}closing the network: the watch of {node_label(axis)} (1016h) is "
+                "not restored: it stops the axis when the recorder falls silent; switch this drive "
+                "off and on before it is used"
+            )
+
     def _restore(self, asked_again: Callable[[], bool]) -> list[DriverError]:
         """Disable, PRE-OPERATIONAL, restore, all within one time limit; every axis is tried.
 
@@ -688,6 +702,7 @@ class CanopenNetwork:
                     left_s,
                 )
                 _try_to_close(confirm, problems)
+            self._keep_watch(axis, problems)
             left[axis.name] = self._setups[axis.node_id].restore(problems)
         if any(left.values()):
             if asked_again():
