@@ -27,7 +27,7 @@ from drivers.canopen.link import (
 from drivers.canopen.node_scan import FoundNode, answering, free_ids, read_identity, scan_link
 from drivers.canopen.pdo import CONTROLWORD, HEARTBEAT_MS, STATUSWORD, AxisPdos, wanted_pdos
 from drivers.canopen.scale import ScaleReading, read_scale
-from drivers.canopen.sdo import SDO_REQUEST, Clock, ObjectAccess, SdoPolicy
+from drivers.canopen.sdo import SDO_REQUEST, Clock, ObjectAccess, SdoPolicy, download_request
 from drivers.canopen.setup import (
     AxisSetup,
     HeartbeatGuard,
@@ -55,6 +55,7 @@ from drivers.messages import Sample
 from drivers.profiles.cia402 import (
     FAULT_RESET_SEQUENCE,
     POWERLESS,
+    ControlCommand,
     Goal,
     State,
     decode,
@@ -65,6 +66,7 @@ from drivers.profiles.profile import Axis, Identity
 ASKED_AT_ONCE = 8  #: Candidates for the recorder's node id that are tried together
 #: The recorder takes the highest free id: this one or a higher one on any usual bus
 LOWEST_USUAL_ID = 112
+REQUESTS_WHILE_CLOSING = 2  #: To each node that is asked whether it answers
 SECOND_ANSWER_S = 0.05  #: For the answer of a second device with one node id
 #: An encoder at rest flickers, and an axis may sink onto its brake between two readings
 STANDSTILL_COUNTS = 1024
@@ -490,16 +492,37 @@ class CanopenNetwork:
         )
 
     def find_silent(self, axes: Sequence[Axis]) -> NodeMissing | None:
-        """Ask all these axes at once for an answer; those without one are skipped from then on."""
-        asked = tuple(axis.node_id for axis in axes)
-        answered = answering(
-            self.link, [n for n in asked if n not in self.link.silent], self.bounds.silence_s
-        )
+        """Ask all these axes at once for an answer; those without one are skipped from then on.
+
+        One answer may get lost: whoever gives none is asked again.
+        """
+        asked = [axis.node_id for axis in axes]
+        unanswered = [node_id for node_id in asked if node_id not in self.link.silent]
+        answered: list[int] = []
+        for _ in range(REQUESTS_WHILE_CLOSING):
+            wait_s = self.bounds.silence_s / REQUESTS_WHILE_CLOSING
+            answered += answering(self.link, unanswered, wait_s)
+            unanswered = [node_id for node_id in unanswered if node_id not in answered]
+            if not unanswered:
+                break
         missing = [axis for axis in axes if axis.node_id not in answered]
         self.link.silent.update(axis.node_id for axis in missing)
         if missing:
-            return NodeMissing(missing, answered, self.bounds.silence_s)
+            return NodeMissing(missing, tuple(sorted(answered)), self.bounds.silence_s)
         return None
+
+    def stop_unheard(self, node_ids: Sequence[int]) -> None:
+        """Request quick stop of nodes that do not answer, without waiting for any answer."""
+        for node_id in node_ids:
+            request = download_request(node_id, CONTROLWORD, ControlCommand.QUICK_STOP)
+            with suppress(DriverError):
+                self.link.send((request,))
+
+    def _stop_pdos_unheard(self, node_ids: Sequence[int]) -> None:
+        """Command PRE-OPERATIONAL of nodes that do not answer, without waiting for a heartbeat."""
+        for node_id in node_ids:
+            with suppress(DriverError):
+                self.link.command_nmt(node_id, NmtCommand.ENTER_PRE_OPERATIONAL)
 
     def check_feedback(self, sample: Sample) -> None:
         """Compare the positions in a sample of axes at standstill with those read by SDO.
@@ -679,6 +702,8 @@ class CanopenNetwork:
         if silent is not None:
             silent.add_note(_unrestored([axis for axis in axes if axis.node_id in silent.node_ids]))
             problems.append(silent)
+            self.stop_unheard(silent.node_ids)
+            self._stop_pdos_unheard(silent.node_ids)
             axes = [axis for axis in axes if axis.node_id not in silent.node_ids]
         ramp_end_ns = self.begin_stop(axes)
         for axis in axes:
