@@ -88,8 +88,8 @@ class Bounds:
     #: than `guard_ms` of a cell whose SYNC has a usual period: a slower heartbeat could not replace
     #: the recorder's.
     free_s: float = 0.35
-    #: For the stop of the axes and the settings that are restored behind it; whatever is not
-    #: restored by then is named. Where the stop is confirmed, the settings have this time anew.
+    #: For the stop of the axes, and as long again for closing the network, which stops what was not
+    #: confirmed and restores the settings; whatever is not restored by then is named.
     closing_s: float = 10.0
 
 
@@ -249,7 +249,10 @@ class CanopenNetwork:
             self.powered.add(axis.node_id)
 
     def begin_closing(self) -> None:
-        """Let everything from here on end within `Bounds.closing_s`; the first call counts."""
+        """Let everything from here on end within `Bounds.closing_s`; the first call counts.
+
+        Leaving the network begins a limit of its own.
+        """
         if self.link.deadline_ns is None:
             self.link.deadline_ns = self.link.clock() + round(self.bounds.closing_s * 1e9)
 
@@ -682,6 +685,7 @@ class CanopenNetwork:
 
         Returns the failures.
         """
+        self.end_closing()  # a stop may have used up its own limit
         self.begin_closing()
         problems: list[DriverError] = []
         axes = [axis for axis in self.axes if axis.node_id in self._setups]

@@ -790,6 +790,17 @@ def test_an_axis_that_does_not_answer_while_the_network_closes_gets_a_quick_stop
     assert bus.nodes[1].nmt == 127
 
 
+def test_a_stop_that_used_up_its_time_leaves_that_for_closing_the_network() -> None:
+    network, bus = cell(2)
+    with network:
+        network.prepare()
+        network.begin_closing()
+        bus.clock.now_ns += 11_000_000_000
+        bus.nodes[0].statusword = 0x0227
+    assert bus.nodes[0].statusword & 0x6F == 0x40
+    assert [node.value(0x6060, 0) for node in bus.nodes] == [8, 8]
+
+
 @dataclass(frozen=True)
 class Closed:
     """Two axes after their network was closed.
