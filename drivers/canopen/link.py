@@ -219,9 +219,12 @@ class Link:
 
     def close(self) -> None:
         """Close the bus if it is open."""
-        if self._bus is not None:
-            self._bus.shutdown()
-        self._bus = self._beat = None
+        bus = self._bus
+        self._bus = None
+        self._beat = None
+        if bus is not None:
+            with bus_errors(self.address):
+                bus.shutdown()
 
     @property
     def bus(self) -> can.BusABC:

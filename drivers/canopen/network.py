@@ -215,15 +215,22 @@ class CanopenNetwork:
                     f"{WHILE}closing the network: it was cut short, and not every axis has "
                     "its settings back"
                 )
+            self._close_link(problems)
             self._note(cut, problems)
             raise
-        finally:
-            self.link.close()
+        self._close_link(problems)
         if error is not None:
             self._note(error, problems)
         elif problems:
             self._note(problems[0], problems[1:])
             raise problems[0]
+
+    def _close_link(self, problems: list[DriverError]) -> None:
+        """Close the bus; a failure is one more among the others, which the operator has to read."""
+        try:
+            self.link.close()
+        except BusError as problem:
+            problems.append(problem)
 
     def _note(self, error: BaseException, problems: Sequence[DriverError]) -> None:
         """Attach failures to close the network, with their own notes,
