@@ -219,9 +219,12 @@ class Link:
 
     def close(self) -> None:
         """Close the bus if it is open."""
-        if self._bus is not None:
-            self._bus.shutdown()
-        self._bus = self._beat = None
+        bus = self._bus
+        self._bus = None
+        self._beat = None
+        if bus is not None:
+            with bus_errors(self.address):
+                bus.shutdown()
 
     @property
     def bus(self) -> can.BusABC:
@@ -300,6 +303,11 @@ class Link:
         """Send a heartbeat with this node id from now on, whenever the bus is read."""
         self._beat = base_frame(HEARTBEAT + node_id, bytes((NmtState.OPERATIONAL,)))
         self._beat_period_ns, self._next_beat_ns = period_ms * 1_000_000, self.clock()
+
+    @property
+    def sends_heartbeat(self) -> bool:
+        """Whether the recorder's heartbeat is sent now."""
+        return self._beat is not None
 
     def stop_heartbeat(self) -> None:
         """Send no heartbeat any more."""

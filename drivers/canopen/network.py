@@ -27,7 +27,7 @@ from drivers.canopen.link import (
 from drivers.canopen.node_scan import FoundNode, answering, free_ids, read_identity, scan_link
 from drivers.canopen.pdo import CONTROLWORD, HEARTBEAT_MS, STATUSWORD, AxisPdos, wanted_pdos
 from drivers.canopen.scale import ScaleReading, read_scale
-from drivers.canopen.sdo import SDO_REQUEST, Clock, ObjectAccess, SdoPolicy
+from drivers.canopen.sdo import SDO_REQUEST, Clock, ObjectAccess, SdoPolicy, download_request
 from drivers.canopen.setup import (
     AxisSetup,
     HeartbeatGuard,
@@ -55,6 +55,7 @@ from drivers.messages import Sample
 from drivers.profiles.cia402 import (
     FAULT_RESET_SEQUENCE,
     POWERLESS,
+    ControlCommand,
     Goal,
     State,
     decode,
@@ -65,6 +66,7 @@ from drivers.profiles.profile import Axis, Identity
 ASKED_AT_ONCE = 8  #: Candidates for the recorder's node id that are tried together
 #: The recorder takes the highest free id: this one or a higher one on any usual bus
 LOWEST_USUAL_ID = 112
+REQUESTS_WHILE_CLOSING = 2  #: To each node that is asked whether it answers
 SECOND_ANSWER_S = 0.05  #: For the answer of a second device with one node id
 #: An encoder at rest flickers, and an axis may sink onto its brake between two readings
 STANDSTILL_COUNTS = 1024
@@ -86,8 +88,8 @@ class Bounds:
     #: than `guard_ms` of a cell whose SYNC has a usual period: a slower heartbeat could not replace
     #: the recorder's.
     free_s: float = 0.35
-    #: For the stop of the axes and the settings that are restored behind it; whatever is not
-    #: restored by then is named. Where the stop is confirmed, the settings have this time anew.
+    #: For the stop of the axes, and as long again for closing the network, which stops what was not
+    #: confirmed and restores the settings; whatever is not restored by then is named.
     closing_s: float = 10.0
 
 
@@ -213,15 +215,22 @@ class CanopenNetwork:
                     f"{WHILE}closing the network: it was cut short, and not every axis has "
                     "its settings back"
                 )
+            self._close_link(problems)
             self._note(cut, problems)
             raise
-        finally:
-            self.link.close()
+        self._close_link(problems)
         if error is not None:
             self._note(error, problems)
         elif problems:
             self._note(problems[0], problems[1:])
             raise problems[0]
+
+    def _close_link(self, problems: list[DriverError]) -> None:
+        """Close the bus; a failure is one more among the others, which the operator has to read."""
+        try:
+            self.link.close()
+        except BusError as problem:
+            problems.append(problem)
 
     def _note(self, error: BaseException, problems: Sequence[DriverError]) -> None:
         """Attach failures to close the network, with their own notes,
@@ -247,7 +256,10 @@ class CanopenNetwork:
             self.powered.add(axis.node_id)
 
     def begin_closing(self) -> None:
-        """Let everything from here on end within `Bounds.closing_s`; the first call counts."""
+        """Let everything from here on end within `Bounds.closing_s`; the first call counts.
+
+        Leaving the network begins a limit of its own.
+        """
         if self.link.deadline_ns is None:
             self.link.deadline_ns = self.link.clock() + round(self.bounds.closing_s * 1e9)
 
@@ -490,16 +502,37 @@ class CanopenNetwork:
         )
 
     def find_silent(self, axes: Sequence[Axis]) -> NodeMissing | None:
-        """Ask all these axes at once for an answer; those without one are skipped from then on."""
-        asked = tuple(axis.node_id for axis in axes)
-        answered = answering(
-            self.link, [n for n in asked if n not in self.link.silent], self.bounds.silence_s
-        )
+        """Ask all these axes at once for an answer; those without one are skipped from then on.
+
+        One answer may get lost: whoever gives none is asked again.
+        """
+        asked = [axis.node_id for axis in axes]
+        unanswered = [node_id for node_id in asked if node_id not in self.link.silent]
+        answered: list[int] = []
+        for _ in range(REQUESTS_WHILE_CLOSING):
+            wait_s = self.bounds.silence_s / REQUESTS_WHILE_CLOSING
+            answered += answering(self.link, unanswered, wait_s)
+            unanswered = [node_id for node_id in unanswered if node_id not in answered]
+            if not unanswered:
+                break
         missing = [axis for axis in axes if axis.node_id not in answered]
         self.link.silent.update(axis.node_id for axis in missing)
         if missing:
-            return NodeMissing(missing, answered, self.bounds.silence_s)
+            return NodeMissing(missing, tuple(sorted(answered)), self.bounds.silence_s)
         return None
+
+    def stop_unheard(self, node_ids: Sequence[int]) -> None:
+        """Request quick stop of nodes that do not answer, without waiting for any answer."""
+        for node_id in node_ids:
+            request = download_request(node_id, CONTROLWORD, ControlCommand.QUICK_STOP)
+            with suppress(DriverError):
+                self.link.send((request,))
+
+    def _stop_pdos_unheard(self, node_ids: Sequence[int]) -> None:
+        """Command PRE-OPERATIONAL of nodes that do not answer, without waiting for a heartbeat."""
+        for node_id in node_ids:
+            with suppress(DriverError):
+                self.link.command_nmt(node_id, NmtCommand.ENTER_PRE_OPERATIONAL)
 
     def check_feedback(self, sample: Sample) -> None:
         """Compare the positions in a sample of axes at standstill with those read by SDO.
@@ -640,11 +673,26 @@ class CanopenNetwork:
             access.write(CONTROLWORD, next_command(state, goal))
             self.link.pass_time()
 
+    def _keep_watch(self, axis: Axis, problems: Sequence[DriverError]) -> None:
+        """Let an amplifier that could not be disabled go on watching the recorder.
+
+        Its heartbeat ends with the network: this is what may still stop the axis.
+        """
+        guard = self._setups[axis.node_id].guard
+        if axis.node_id in self.powered and guard.watching and self.link.sends_heartbeat:
+            guard.stays = True
+            problems[-1].add_note(
+                f"{WHILE}closing the network: the watch of {node_label(axis)} (1016h) is "
+                "not restored: it stops the axis when the recorder falls silent; switch this drive "
+                "off and on before it is used"
+            )
+
     def _restore(self, asked_again: Callable[[], bool]) -> list[DriverError]:
         """Disable, PRE-OPERATIONAL, restore, all within one time limit; every axis is tried.
 
         Returns the failures.
         """
+        self.end_closing()  # a stop may have used up its own limit
         self.begin_closing()
         problems: list[DriverError] = []
         axes = [axis for axis in self.axes if axis.node_id in self._setups]
@@ -665,6 +713,8 @@ class CanopenNetwork:
         if silent is not None:
             silent.add_note(_unrestored([axis for axis in axes if axis.node_id in silent.node_ids]))
             problems.append(silent)
+            self.stop_unheard(silent.node_ids)
+            self._stop_pdos_unheard(silent.node_ids)
             axes = [axis for axis in axes if axis.node_id not in silent.node_ids]
         ramp_end_ns = self.begin_stop(axes)
         for axis in axes:
@@ -688,6 +738,7 @@ class CanopenNetwork:
                     left_s,
                 )
                 _try_to_close(confirm, problems)
+            self._keep_watch(axis, problems)
             left[axis.name] = self._setups[axis.node_id].restore(problems)
         if any(left.values()):
             if asked_again():

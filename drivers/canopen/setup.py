@@ -278,6 +278,7 @@ class HeartbeatGuard:
         self, access: ObjectAccess, consumers: Consumers | None, left_over: Callable[[int], bool]
     ) -> None:
         self.lack = ""  #: Missing capability, in words; empty when nothing is missing
+        self.stays = False  #: Whether its values stay when all other settings are restored
         self._access = access
         self._consumer: ObjectEntry | None = None
         self._consumer_before = 0
@@ -583,7 +584,8 @@ class AxisSetup:
         for entry in (SYNC_COUNTER, MODE_OF_OPERATION):
             if entry in self._before:
                 yield f"{entry.index:04X}h", partial(self._access.write, entry, self._before[entry])
-        yield "1016h", self.guard.disarm
+        if not self.guard.stays:
+            yield "1016h", self.guard.disarm
         if HEARTBEAT_TIME in self._before:
             yield "1017h", partial(self._access.write, HEARTBEAT_TIME, self._before[HEARTBEAT_TIME])
 

@@ -503,6 +503,7 @@ class _Execution:
         if silent is not None:
             unheard = silent.node_ids
             self.problems.append(silent)
+            self._network.stop_unheard(unheard)
         heard = [node for node in nodes if node.node_id not in unheard]
         ramp_end_ns = self._network.begin_stop(heard)
         for axis, node in zip(unconfirmed, nodes, strict=True):

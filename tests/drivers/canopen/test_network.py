@@ -753,6 +753,87 @@ def test_one_bus_that_fails_while_the_network_closes_does_not_leave_the_other_ax
         assert reported == 1
 
 
+def lose_answers(bus: ScriptedBus, node_id: int, number: int) -> None:
+    """Lose the next SDO answers of a node, so many of them."""
+    lost: list[can.Message] = []
+
+    def tamper(message: can.Message) -> tuple[can.Message, ...]:
+        if message.arbitration_id == 0x580 + node_id and len(lost) < number:
+            lost.append(message)
+            return ()
+        return (message,)
+
+    bus.tamper = tamper
+
+
+def test_an_axis_whose_first_answer_is_lost_while_the_network_closes_is_stopped_and_restored() -> (
+    None
+):
+    network, bus = cell(2)
+    with network:
+        network.prepare()
+        bus.nodes[1].statusword = 0x0227
+        lose_answers(bus, 2, number=1)
+    assert bus.nodes[1].statusword & 0x6F == 0x40
+    assert bus.nodes[1].value(0x6060, 0) == 8
+
+
+def test_an_axis_that_does_not_answer_while_the_network_closes_gets_a_quick_stop_all_the_same() -> (
+    None
+):
+    network, bus = cell(2)
+    with pytest.raises(NodeMissing, match=r"J2 \(node 2\) did not answer"), network:
+        network.prepare()
+        bus.nodes[1].statusword = 0x0227
+        silence(bus, 2)
+    assert bus.nodes[1].statusword & 0x6F == 0x07
+    assert bus.nodes[1].nmt == 127
+
+
+def test_a_stop_that_used_up_its_time_leaves_that_for_closing_the_network() -> None:
+    network, bus = cell(2)
+    with network:
+        network.prepare()
+        network.begin_closing()
+        bus.clock.now_ns += 11_000_000_000
+        bus.nodes[0].statusword = 0x0227
+    assert bus.nodes[0].statusword & 0x6F == 0x40
+    assert [node.value(0x6060, 0) for node in bus.nodes] == [8, 8]
+
+
+def test_an_adapter_that_cannot_be_closed_does_not_hide_what_was_not_restored(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    network, bus = cell(2)
+
+    def fail() -> None:
+        raise can.CanOperationError("the adapter was pulled")
+
+    monkeypatch.setattr(bus, "shutdown", fail)
+    with pytest.raises(ValueError, match="cause") as error, network:
+        network.prepare()
+        silence(bus, 2)
+        raise ValueError("cause")
+    notes = " ".join(error.value.__notes__)
+    assert "settings of J2 (node 2) not restored" in notes
+    assert "the adapter was pulled" in notes
+
+
+def test_an_adapter_that_cannot_be_closed_is_an_error_of_the_bus(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    network, bus = cell(2)
+
+    def fail() -> None:
+        raise can.CanOperationError("the adapter was pulled")
+
+    monkeypatch.setattr(bus, "shutdown", fail)
+    with pytest.raises(BusError, match="the adapter was pulled"), network:
+        network.prepare()
+    with pytest.raises(BusError, match="is not open"):
+        network.prepare()
+
+
 @dataclass(frozen=True)
 class Closed:
     """Two axes after their network was closed.

@@ -8,7 +8,7 @@ import can
 import pytest
 
 from drivers.canopen.network import CanopenNetwork
-from drivers.errors import BusBusy, MotionTimeout, SetupRefused
+from drivers.errors import BusBusy, MotionTimeout, ObjectAccessError, SetupRefused
 from drivers.messages import CellEvent, EventKind
 from drivers.motion.execute import execute
 from drivers.move import Move
@@ -107,6 +107,31 @@ def test_an_amplifier_watches_the_recorder_and_gets_its_settings_back(before: in
         expected = 0
     assert watched(*bus.nodes) == [expected, expected]
     assert reactions(*bus.nodes) == [1, 1]
+
+
+def test_an_amplifier_that_cannot_be_disabled_goes_on_watching_the_recorder() -> None:
+    network, bus = guarded_cell()
+    refusing = bus.nodes[0]
+    with pytest.raises(ObjectAccessError) as failure, network:
+        network.prepare()
+        network.guard()
+        refusing.statusword = 0x0227
+        refusing.aborts[0x6040, 0] = 0x08000022
+    assert watched(*bus.nodes) == [WATCHES_RECORDER, 0]
+    assert reactions(*bus.nodes) == [3, 1]
+    assert refusing.value(0x6060, 0) == 8
+    notes = " ".join(failure.value.__notes__)
+    assert "the watch of J1 (node 1) (1016h) is not restored" in notes
+
+
+def test_an_amplifier_that_never_heard_the_recorder_gets_its_watch_back() -> None:
+    network, bus = guarded_cell()
+    refusing = bus.nodes[0]
+    with pytest.raises(ObjectAccessError), network:
+        network.prepare()
+        refusing.statusword = 0x0227
+        refusing.aborts[0x6040, 0] = 0x08000022
+    assert watched(*bus.nodes) == [0, 0]
 
 
 def test_what_an_amplifier_lacks_is_said() -> None:

@@ -775,6 +775,32 @@ def test_a_second_failure_during_a_stop_does_not_keep_the_axes_from_being_stoppe
     assert str(bus_off) in " ".join(stopped.value.__notes__)
 
 
+def test_an_axis_that_answers_nothing_gets_a_quick_stop_by_sdo_all_the_same(
+    moving: Moving,
+) -> None:
+    network, _, bus, events = moving
+    dumb = bus.nodes[1]
+
+    def without_answers(message: can.Message) -> tuple[can.Message, ...]:
+        if message.arbitration_id in (0x182, 0x282, 0x582, 0x702):
+            return ()
+        return (message,)
+
+    def deaf(cycle: int) -> None:
+        if cycle == 60:
+            bus.tamper = without_answers
+        if EventKind.STOP in [event.kind for event in events]:
+            dumb.nmt = 127  # it has booted: no PDO acts any more
+            dumb.statusword = dumb.statusword & ~0x6F | 0x27
+
+    bus.on_cycle = deaf
+    with pytest.raises(DriverError):
+        run(moving, FAR)
+    assert dumb.statusword & 0x6F == 0x07
+    network.link.silent.clear()  # the end of the test asks it again
+    bus.on_cycle = lambda _cycle: None
+
+
 def test_axes_of_a_good_bus_are_stopped_behind_three_failures(
     moving: Moving, monkeypatch: pytest.MonkeyPatch
 ) -> None:
