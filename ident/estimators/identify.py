@@ -15,7 +15,7 @@ from ident.data.dataset import Dataset
 from ident.data.run import Run, SeenRuns, require_entry, require_named, usual_conditioning
 from ident.data.run_channels import RunChannels, channels_of, require_usable_channels
 from ident.equations.instants import Instants, instants_of
-from ident.equations.observation import observe
+from ident.equations.observation import Observation, observe
 from ident.equations.reduction import reduce_built, regrouped, require_moved, rows_of_runs
 from ident.equations.rows import Rows, rows_of
 from ident.equations.system import System, require_distinct
@@ -150,12 +150,21 @@ def identify(
     rows = [rows_of_run for _, rows_of_run in kept]
     observation = observe(model, datasets, conditioning, system, rows)
     found = replace(found, gathered=(datasets, observation))
-    # Limits may take samples of held-out runs out, but held-out runs decide nothing of the fit.
-    is_of_fit = observation.run < len(channels)
-    limits = limited_currents(observation.only(is_of_fit), estimate)
+    limits = _limits_in_runs(observation, len(channels), estimate)
     if not limits:
         return found
     return _without_limited_currents(found, datasets, limits, known_gains)
+
+
+def _limits_in_runs(
+    observation: Observation, run_count: int, estimate: Estimate
+) -> tuple[LimitedCurrent, ...]:
+    """Limits of the currents by the first runs, which are those of the fit.
+
+    They may take samples of held-out runs out, but held-out runs decide nothing of the fit.
+    """
+    is_of_fit = observation.run < run_count
+    return limited_currents(observation.only(is_of_fit), estimate)
 
 
 def _checked_estimate(
