@@ -147,8 +147,8 @@ _NO_POWER = (
     "axes that keep their supply and their power from the first SYNC to the last",
     "check the drive's supply and the safety chain (STO, doors, enable), then repeat the command",
 )
-"""Of an axis that booted again, stopped answering or lost its power, and reported neither error nor
-fault.
+"""Expected and remedy where an axis booted again, stopped answering or lost its power, without the
+report of an error or a fault.
 """
 _FAULT_WITHOUT_CODE = (
     "axes without a fault from the first SYNC to the last",

@@ -269,8 +269,9 @@ def _refuse_other_kind(path: Path, source: Path, head: bytes) -> NoReturn:
 
 
 def first_bytes(path: Path) -> bytes:
-    """Return the first bytes of a file, by which its kind is known; none if it cannot be read:
-    whoever opens it then reports that.
+    """Return the first bytes of a file, by which its kind is known.
+
+    There are none where it cannot be read; opening it reports that.
     """
     with suppress(OSError), open_regular(path) as stream:
         return stream.read(HEAD_BYTES)

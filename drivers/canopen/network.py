@@ -504,13 +504,13 @@ class CanopenNetwork:
     def find_silent(self, axes: Sequence[Axis]) -> NodeMissing | None:
         """Ask all these axes at once for an answer; those without one are skipped from then on.
 
-        One answer may get lost: whoever gives none is asked again.
+        One answer may get lost, so those without one are asked again.
         """
         asked = [axis.node_id for axis in axes]
         unanswered = [node_id for node_id in asked if node_id not in self.link.silent]
         answered: list[int] = []
+        wait_s = self.bounds.silence_s / REQUESTS_WHILE_CLOSING
         for _ in range(REQUESTS_WHILE_CLOSING):
-            wait_s = self.bounds.silence_s / REQUESTS_WHILE_CLOSING
             answered += answering(self.link, unanswered, wait_s)
             unanswered = [node_id for node_id in unanswered if node_id not in answered]
             if not unanswered:

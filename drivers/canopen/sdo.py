@@ -1,8 +1,8 @@
 """SDO access that reads the bus itself, retries, and takes no answer about another object.
 
-A late answer about the same object cannot be told from the answer to the present request: CiA 301
-has a toggle bit in segments alone, and an abort is not confirmed. Where a write must be certain,
-the object, or what follows from it, is read afterwards.
+A late answer about the same object looks like the answer to the present request: in CiA 301 only
+segments have a toggle bit, and an abort is not confirmed. Where a write must be certain, the
+object, or what follows from it, is read afterwards.
 """
 
 from __future__ import annotations
@@ -382,7 +382,7 @@ class SynchronousSdoClient(SdoClient):
 
         Args:
             first: the answer to the last request; empty where no other may be compared with it.
-            second: an answer that nobody waits for, or about another object than requested.
+            second: an answer that was not requested, or about another object than requested.
         """
         node_id = self.tx_cobid - SDO_ANSWER
         if first and second[1:4] == first[1:4] and self._bus.asked_by.get(node_id) is self:

@@ -121,9 +121,7 @@ def execute(
         for number, move in enumerate(moves):
             yield from execution.move(number, move)
         yield from execution.stop()
-        if not execution.problems:  # amplifiers without confirmed standstill go on watching us
-            network.unguard()
-            network.end_closing()
+        execution.end_watch()
     except BaseException as error:
         # Also a closed generator and an interrupt, during the stop above as well: it then runs
         # without yielding.
@@ -135,9 +133,7 @@ def execute(
             except BaseException as cut:
                 cut.add_note(f"{WHILE}stopping: the stop was cut short")
                 raise
-            if not execution.problems:
-                network.unguard()
-                network.end_closing()
+            execution.end_watch()
         execution.note_failures(error)
         raise
     execution.raise_failures()
@@ -236,6 +232,15 @@ class _Execution:
         """Report why the moves end before the last one."""
         with self._events_may_fail():
             self._bus.report(None, EventKind.ENDED, 0, _cause(cause))
+
+    def end_watch(self) -> None:
+        """End the amplifiers' watch, and the time limit of the stop, where the stop is confirmed.
+
+        Amplifiers without confirmed standstill go on watching the recorder.
+        """
+        if not self.problems:
+            self._network.unguard()
+            self._network.end_closing()
 
     def note_failures(self, error: BaseException) -> None:
         """Note on the error that a stop was made for what the stop could not confirm or report."""

@@ -122,8 +122,8 @@ class Counterbalance(Effect):
     needs_revolute = True
     refined = ("ratio", "phase_rad")
 
-    #: ρ; below this range the torque is that of gravity with a second harmonic, from which ρ and α
-    #: cannot be told.
+    #: ρ; below this range the torque is that of gravity with a second harmonic, which does not
+    #: determine ρ and α.
     ratio: Annotated[float, Range(0.05, 0.95)]
     phase_rad: Annotated[float, Range(-10.0, 10.0)]  #: α
     with_spring: Switch = 1  #: 1 where sin x can be told from gravity, else 0

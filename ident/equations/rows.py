@@ -109,7 +109,8 @@ def row_masks(
     largest_share = conditioning.standstill_share
     still_share = _share_without(data.moving, window)
     invalid_share = _share_without(data.valid, window)
-    use = (still_share <= largest_share) & (invalid_share == 0.0)
+    is_wrong = invalid_share > 0.0
+    use = (still_share <= largest_share) & ~is_wrong
     motor_still = _share_without(data.motor_moving, window) > largest_share
     if conditioning.current_cutoff_hz:
         memory = _shares(torque_rows(data.rate_hz, conditioning))
@@ -124,8 +125,7 @@ def row_masks(
     motor_use = np.empty_like(use)
     for motor, still in enumerate(motor_still):
         joints = is_mixed[motor] | is_turned[motor]
-        is_wrong = invalid_share[motor] > 0.0
-        motor_use[motor] = use[joints].all(axis=0) & ~still & ~is_wrong
+        motor_use[motor] = use[joints].all(axis=0) & ~still & ~is_wrong[motor]
     # A coupled motor that sticks leaves an undetermined torque in the equations of all joints it
     # turns with.
     for motor in drive_train.coupled:
@@ -134,8 +134,7 @@ def row_masks(
     # Row j is Y_j = Σ_i r_ij g_i v_i: a current that is wrong spoils the rows of all joints that
     # its motor turns.
     for motor, turned in enumerate(is_turned):
-        is_wrong = invalid_share[motor] > 0.0
-        spoiled = turned[:, None] & is_wrong[None, :]
+        spoiled = turned[:, None] & is_wrong[motor][None, :]
         use &= ~spoiled
     if model.is_redundant:
         all_move = use.all(axis=0) & motor_use.all(axis=0)

@@ -801,15 +801,15 @@ def test_a_stop_that_used_up_its_time_leaves_that_for_closing_the_network() -> N
     assert [node.value(0x6060, 0) for node in bus.nodes] == [8, 8]
 
 
+def _fail_as_a_pulled_adapter() -> None:
+    raise can.CanOperationError("the adapter was pulled")
+
+
 def test_an_adapter_that_cannot_be_closed_does_not_hide_what_was_not_restored(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     network, bus = cell(2)
-
-    def fail() -> None:
-        raise can.CanOperationError("the adapter was pulled")
-
-    monkeypatch.setattr(bus, "shutdown", fail)
+    monkeypatch.setattr(bus, "shutdown", _fail_as_a_pulled_adapter)
     with pytest.raises(ValueError, match="cause") as error, network:
         network.prepare()
         silence(bus, 2)
@@ -823,11 +823,7 @@ def test_an_adapter_that_cannot_be_closed_is_an_error_of_the_bus(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     network, bus = cell(2)
-
-    def fail() -> None:
-        raise can.CanOperationError("the adapter was pulled")
-
-    monkeypatch.setattr(bus, "shutdown", fail)
+    monkeypatch.setattr(bus, "shutdown", _fail_as_a_pulled_adapter)
     with pytest.raises(BusError, match="the adapter was pulled"), network:
         network.prepare()
     with pytest.raises(BusError, match="is not open"):
