@@ -71,7 +71,8 @@ def identify(
         method: estimator, or its name.
         fixed_gains: known gains, shape (m,).
         keep_rows: keep all runs and their rows, for a search for effects by ``ml``; otherwise no
-            run is kept.
+            run is kept, and samples in which a drive gave less current than its reference are not
+            looked for and stay in the fit.
         judge: refuse a fit that its data contradict; False where effects are declared that the
             model lacks here.
         axes: name of each axis in messages, shape (m,); that of its joint when None.
