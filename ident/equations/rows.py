@@ -1,5 +1,5 @@
-"""Rows of [V | W] of one run in standard parameters, filtered and decimated;
-the columns of a motor (paper eq. 5).
+"""Rows of [V | W] of one run in standard parameters, filtered and decimated (paper eqs. 13 and 14);
+the columns of a motor.
 """
 
 from __future__ import annotations

@@ -18,9 +18,9 @@ from ident.model.model import Column, DriveTrain, Model
 
 @dataclass(frozen=True, slots=True)
 class Equations:
-    """Unknowns of eq.
+    """Unknowns of equation (17), and the runs that show them.
 
-    (17), and the runs that show them: W_tot χ_tot = ρ with χ_tot = (g, χ, χ_uL, 1).
+    W_tot χ_tot = ρ with χ_tot = (g, χ, χ_uL, 1).
     """
 
     model: Model  #: the declared model
