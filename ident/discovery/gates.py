@@ -385,10 +385,12 @@ class PartsLeftOut:
             motors=len(problem.gamma),
         )
 
-    def refusal(self, columns: FloatArray) -> str:
-        """Why whitened columns, (rows, p), may not join.
+    def refusal(self, columns: FloatArray, coefficients: FloatArray) -> str:
+        """Why an effect may not join; empty where it may, or nothing can be left out.
 
-        Empty where they may, or nothing can be left out.
+        Args:
+            columns: Φ, whitened, shape (rows, p).
+            coefficients: c of all parts, shape (p,).
         """
         if not self.others:
             return ""
@@ -399,7 +401,9 @@ class PartsLeftOut:
             return harm
         # Too few blocks show nothing, but forbid nothing either: the folds of moves have judged.
         problem = self.search_problem.folds.linearisation
-        of_motor = np.bincount(problem.motor, np.sum(columns**2, axis=1))
+        # ‖Φ c‖² of each motor: columns alone have the units of their coefficients.
+        effect = columns @ coefficients
+        of_motor = np.bincount(problem.motor, effect**2)
         most_affected = int(np.argmax(of_motor))
         if not change.is_enough or change.is_fall(most_affected):
             return ""
