@@ -116,8 +116,8 @@ def row_masks(
         memory = _shares(torque_rows(data.rate_hz, conditioning))
         shortest = round(SHORTEST_REST_S * data.rate_hz)
         use &= _share_without(~_rests(~data.moving, shortest), memory) <= largest_share
-        is_known = data.valid.any(axis=1, keepdims=True)
-        use &= _share_without(is_known, memory) == 0.0
+        is_known = data.valid.any(axis=1)
+        use &= _share_without(is_known[:, None], memory) == 0.0
         motor_rests = _rests(~data.motor_moving, shortest)
         motor_still |= _share_without(~motor_rests, memory) > largest_share
     # Motor i's equation mixes the joints in row i of T (DriveTrain.to_motor); each of them must
