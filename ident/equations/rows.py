@@ -116,7 +116,7 @@ def row_masks(
         memory = _shares(torque_rows(data.rate_hz, conditioning))
         shortest = round(SHORTEST_REST_S * data.rate_hz)
         use &= _share_without(~_rests(~data.moving, shortest), memory) <= largest_share
-        is_known = data.valid.any(axis=1)
+        is_known = np.asarray(data.valid.any(axis=1), dtype=np.bool_)
         use &= _share_without(is_known[:, None], memory) == 0.0
         motor_rests = _rests(~data.motor_moving, shortest)
         motor_still |= _share_without(~motor_rests, memory) > largest_share
