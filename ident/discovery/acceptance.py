@@ -35,10 +35,11 @@ from ident.discovery.evidence import Evidence, place_names, with_effects
 from ident.discovery.gates import Gates, require_gates
 from ident.discovery.joining import FIT_ERRORS, JointFit, linearised
 from ident.discovery.loop import Step, end_search
-from ident.effects.effect import PlacedEffect
+from ident.effects.effect import GearSide, PlacedEffect
 from ident.effects.geometry_corrections import is_correction
 from ident.estimators.estimate import RelativeError
 from ident.estimators.identify import estimate_with
+from ident.model.model import DriveTrain
 
 
 @takes(
@@ -227,12 +228,7 @@ def _verdict(start: Evidence, current: Evidence, placed: PlacedEffect) -> Effect
         without = start
         is_needed = True
     change = compare_on_holdout(start, without, current)
-    # A correction of the description changes all motors: that its own falls is no more than
-    # friction there does.
-    is_driven = placed.axis < len(change.motors)
-    motor: int | None = None
-    if is_driven and placed.effect.has_axis and not is_correction(placed):
-        motor = placed.axis
+    motor = _own_motor(placed, current.model.drive_train)
     judgement, reason = judge_change(change, motor)
     return EffectVerdict(
         placed=placed,
@@ -243,6 +239,23 @@ def _verdict(start: Evidence, current: Evidence, placed: PlacedEffect) -> Effect
         after=_torque_error(current),
         is_needed=is_needed,
     )
+
+
+def _own_motor(placed: PlacedEffect, drive_train: DriveTrain) -> int | None:
+    """Index of the motor whose error an effect must lower; None where it is no single one.
+
+    Motors may be numbered in another order than the joints that they turn.
+    """
+    # A correction of the description changes all motors: that its own falls is no more than
+    # friction there does.
+    if not placed.effect.has_axis or is_correction(placed):
+        return None
+    if placed.effect.side is GearSide.MOTOR:
+        return placed.axis
+    joints = drive_train.joints
+    if placed.axis not in joints:
+        return None
+    return joints.index(placed.axis)
 
 
 def _leaving(judged: Sequence[EffectVerdict], *, write_undecided: bool) -> EffectVerdict | None:

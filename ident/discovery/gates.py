@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from math import ceil
 
 import numpy as np
 import scipy  # loads scipy.special when it is first used: a fit needs none of it
@@ -79,7 +80,8 @@ class Gates:
 
 
 def require_gates(gates: Gates) -> None:
-    """Refuse limits that are no shares, and a number of draws that is none.
+    """Refuse limits that are no shares, and a number of draws that is none, or with which no
+    candidate can be as unlikely as asked.
 
     Raises:
         ModelError: for the limit.
@@ -96,6 +98,19 @@ def require_gates(gates: Gates) -> None:
             raise ModelError(
                 f"{label} is {share:g}; expected a share from 0 to 1; {field.default:g} is usual"
             )
+    # The smallest probability that draws can show is 1/(draws + 1).
+    smallest_probability = 1.0 / (gates.draws + 1)
+    rounding = 1.0 + 1e-9
+    if smallest_probability > gates.false_alarm * rounding:
+        needed = "a probability above zero"
+        if gates.false_alarm > 0.0:
+            draws = ceil(1.0 / (gates.false_alarm * rounding)) - 1
+            needed = f"at least {draws} draws"
+        raise ModelError(
+            f"draws of the gates is {gates.draws}, which shows no probability below "
+            f"{smallest_probability:.2g}, and false_alarm is {gates.false_alarm:g}; expected "
+            f"{needed}; 999 is usual"
+        )
 
 
 def impossible(
@@ -370,10 +385,12 @@ class PartsLeftOut:
             motors=len(problem.gamma),
         )
 
-    def refusal(self, columns: FloatArray) -> str:
-        """Why whitened columns, (rows, p), may not join.
+    def refusal(self, columns: FloatArray, coefficients: FloatArray) -> str:
+        """Why an effect may not join; empty where it may, or nothing can be left out.
 
-        Empty where they may, or nothing can be left out.
+        Args:
+            columns: Φ, whitened, shape (rows, p).
+            coefficients: c of all parts, shape (p,).
         """
         if not self.others:
             return ""
@@ -384,7 +401,9 @@ class PartsLeftOut:
             return harm
         # Too few blocks show nothing, but forbid nothing either: the folds of moves have judged.
         problem = self.search_problem.folds.linearisation
-        of_motor = np.bincount(problem.motor, np.sum(columns**2, axis=1))
+        # ‖Φ c‖² of each motor: columns alone have the units of their coefficients.
+        effect = columns @ coefficients
+        of_motor = np.bincount(problem.motor, effect**2)
         most_affected = int(np.argmax(of_motor))
         if not change.is_enough or change.is_fall(most_affected):
             return ""

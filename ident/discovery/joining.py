@@ -508,7 +508,7 @@ def judge_beside_others(
     reasons.append(impossible(effect.coefficients, values, deviations))
     if is_friction_of_motion(effect):
         reasons.append(describe_driving_friction(model.evidence, placed.axis))
-    reasons.append(PartsLeftOut.of(problem).refusal(columns))
+    reasons.append(PartsLeftOut.of(problem).refusal(columns, values))
     given = [reason for reason in reasons if reason]
     each_once = dict.fromkeys(given)
     return finding.left_out_fall, "; ".join(each_once)

@@ -627,7 +627,8 @@ class _Tested:
         """Whether parts left out refuse a finding; it is then set aside."""
         if found is None:
             return False
-        why = self.parts.refusal(whitened_columns(self.problem, found.effect, found.axis))
+        columns = whitened_columns(self.problem, found.effect, found.axis)
+        why = self.parts.refusal(columns, found.coefficients)
         if not why:
             return False
         self.findings = _refused(self.findings, found, why)

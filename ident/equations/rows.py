@@ -1,5 +1,5 @@
-"""Rows of [V | W] of one run in standard parameters, filtered and decimated;
-the columns of a motor (paper eq. 5).
+"""Rows of [V | W] of one run in standard parameters, filtered and decimated (paper eqs. 13 and 14);
+the columns of a motor.
 """
 
 from __future__ import annotations
@@ -94,8 +94,9 @@ def row_masks(
 
     Where the currents went through a low-pass, a row has torques of samples around its own window,
     too. At most `standstill_share` of it may be those of a rest, in which dry friction may be any.
-    A joint that turns back rests for a moment only, and its friction turns with it. Samples that
-    are not valid do no harm there: their positions are known.
+    A joint that turns back rests for a moment only, and its friction turns with it. Samples whose
+    current alone is not valid do no harm there; where no axis is valid, positions are not known,
+    and neither is any torque.
 
     A flag of `Dataset.valid` is of an axis: of the position of joint i, and of the current of
     motor i, which is in the equations of all joints that it turns.
@@ -116,6 +117,8 @@ def row_masks(
         memory = _shares(torque_rows(data.rate_hz, conditioning))
         shortest = round(SHORTEST_REST_S * data.rate_hz)
         use &= _share_without(~_rests(~data.moving, shortest), memory) <= largest_share
+        is_known = np.asarray(data.valid.any(axis=1), dtype=np.bool_)
+        use &= _share_without(is_known[:, None], memory) == 0.0
         motor_rests = _rests(~data.motor_moving, shortest)
         motor_still |= _share_without(~motor_rests, memory) > largest_share
     # Motor i's equation mixes the joints in row i of T (DriveTrain.to_motor); each of them must

@@ -18,9 +18,9 @@ from ident.model.model import Column, DriveTrain, Model
 
 @dataclass(frozen=True, slots=True)
 class Equations:
-    """Unknowns of eq.
+    """Unknowns of equation (17), and the runs that show them.
 
-    (17), and the runs that show them: W_tot χ_tot = ρ with χ_tot = (g, χ, χ_uL, 1).
+    W_tot χ_tot = ρ with χ_tot = (g, χ, χ_uL, 1).
     """
 
     model: Model  #: the declared model
@@ -314,10 +314,11 @@ def require_distinct(system: System, *, gains: bool) -> None:
         gains: whether the gains are unknown too.
 
     Raises:
-        RankDeficient: [W | W_uL | W_kL χ_kL] has dependent columns, as when every run carries the
-            payload, or a motor's current is constant zero.
+        RankDeficient: [W | W_uL | W_kL χ_kL], or with known gains [W | W_uL], has dependent
+            columns, as when every run carries the payload; or, with unknown gains, a motor's
+            current is constant zero.
     """
-    dependent = _dependent_unknowns(system)
+    dependent = dependent_unknowns(system, gains=gains)
     if dependent:
         remedy = _remedy_of_dependence(system, dependent)
         raise RankDeficient(f"the data do not distinguish payload and robot: {remedy}", dependent)
@@ -325,12 +326,20 @@ def require_distinct(system: System, *, gains: bool) -> None:
         _require_currents(system)
 
 
-def _dependent_unknowns(system: System) -> tuple[str, ...]:
-    """Names of the unknowns whose columns depend on those of the others."""
+def dependent_unknowns(system: System, *, gains: bool) -> tuple[str, ...]:
+    """Names of the unknowns whose columns depend on those of the others.
+
+    Where the gains are known, what is known of the payloads is no unknown: W_kL χ_kL goes to the
+    right side, with the measured torque.
+
+    Args:
+        system: of the fit.
+        gains: whether the gains are unknown too.
+    """
     names = [column.name for column in system.unknowns]
     without_currents = [factor[:, system.axis_count :] for factor in system.joints.factors]
     columns = np.concatenate(without_currents)
-    if system.knows_payload:
+    if gains and system.knows_payload:
         names.append(KNOWN_PAYLOAD)
     else:
         columns = columns[:, :-1]

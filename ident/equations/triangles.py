@@ -93,10 +93,10 @@ def solve(matrix: FloatArray, right: FloatArray) -> tuple[FloatArray, FloatArray
 
     Args:
         matrix: M, shape (k, c).
-        right: shape (k,).
+        right: one right-hand side, shape (k,), or several, (k, s).
 
     Returns:
-        the solution, shape (c,), and (MᵀM)⁻¹, shape (c, c).
+        the solution, shape (c,) or (c, s), and (MᵀM)⁻¹, shape (c, c).
 
     Scaling columns changes no least-squares solution, but spares digits where one is in kg and
     another in kg m².

@@ -71,7 +71,8 @@ def identify(
         method: estimator, or its name.
         fixed_gains: known gains, shape (m,).
         keep_rows: keep all runs and their rows, for a search for effects by ``ml``; otherwise no
-            run is kept.
+            run is kept, and samples in which a drive gave less current than its reference are not
+            looked for and stay in the fit.
         judge: refuse a fit that its data contradict; False where effects are declared that the
             model lacks here.
         axes: name of each axis in messages, shape (m,); that of its joint when None.
@@ -153,7 +154,7 @@ def identify(
     limits = _limits_in_runs(observation, len(channels), estimate)
     if not limits:
         return found
-    return _without_limited_currents(found, datasets, limits, known_gains)
+    return _without_limited_currents(found, datasets, limits, known_gains, axes, judge=judge)
 
 
 def _limits_in_runs(
@@ -218,6 +219,9 @@ def _without_limited_currents(
     datasets: Sequence[Dataset],
     limits: Sequence[LimitedCurrent],
     fixed_gains: FloatArray | None,
+    axes: Sequence[str],
+    *,
+    judge: bool,
 ) -> Identification:
     """Fit again without the samples in which a drive gave less current than its reference.
 
@@ -226,9 +230,12 @@ def _without_limited_currents(
         datasets: all its runs, held-out runs last.
         limits: of its drives.
         fixed_gains: known gains, shape (m,).
+        axes: name of each axis.
+        judge: the errors too.
 
     Raises:
-        DataUnfit, RankDeficient, NotConverged: too little is left.
+        DataUnfit, RankDeficient, PayloadUnseen, NotConverged: too little is left.
+        IdentificationError: the data contradict the estimate, as those of the first fit might.
     """
     model = found.model
     conditioning = found.conditioning
@@ -243,7 +250,10 @@ def _without_limited_currents(
     if holdout is not None:
         held_out = reduce_built(model, built[fit_count:], payloads=system.payloads)
         holdout = regrouped(held_out, system.base, system.payload_columns)
-    estimate = estimate_with(method, system, fixed_gains)
+    # Fewer samples may not distinguish what all of them did: the checks of the first fit hold here.
+    causes = found.channels
+    with with_unit_causes(causes, model, axes), with_channel_causes(causes, axes):
+        estimate = _checked_estimate(system, method, fixed_gains, axes, judge=judge)
     observation = observe(model, kept, conditioning, system, rows)
     channels: list[RunChannels] = []
     for of_run, data in zip(found.channels, datasets[:fit_count], strict=True):

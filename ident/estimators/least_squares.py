@@ -27,7 +27,7 @@ def ls(system: System, fixed_gains: FloatArray | None = None) -> Estimate:
         fixed_gains: known gains [Nm/A], shape (m,); then it is the classical IDIM-LS (eq. 7).
 
     Raises:
-        DataUnfit: free gains without a known payload: every gain could be scaled at will.
+        PayloadMissing: free gains without a known payload: every gain could be scaled at will.
     """
     weight = np.ones(system.axis_count)
     return _solve(system, weight, Method.LS, fixed_gains)
@@ -45,8 +45,8 @@ def wls(system: System, fixed_gains: FloatArray | None = None) -> Estimate:
 def wls_row_std(system: System, fixed_gains: FloatArray | None = None) -> FloatArray:
     """Standard deviation by which ``wls`` divides the rows of each joint, shape (n,) [Nm].
 
-    With fixed gains it is that of §2.2, `joint_error_std`. Where gains are free, or the robot is
-    redundant, it is that of the global ``ls`` solution for all joints. §2.2 has none to offer
+    With fixed gains it is that of §2.3, `joint_error_std`. Where gains are free, or the robot is
+    redundant, it is that of the global ``ls`` solution for all joints. §2.3 has none to offer
     there: where a known mass exerts no torque on a joint, as on every wrist, the right-hand side of
     this joint's own equations (eq. 15) is zero, and so are their solution and its error. A joint of
     a redundant robot has no equations of its own.
@@ -59,7 +59,7 @@ def wls_row_std(system: System, fixed_gains: FloatArray | None = None) -> FloatA
 
 
 def joint_error_std(triangles: Triangles, gains: FloatArray) -> FloatArray:
-    """Standard deviation of the error of each joint's own equations (§2.2), shape (n,) [Nm].
+    """Standard deviation of the error of each joint's own equations (§2.3), shape (n,) [Nm].
 
     They are solved by least squares.
 
@@ -198,7 +198,7 @@ def tls(system: System, scaling: Scaling = Scaling.ROWS) -> Estimate:
             RESIDUALS there.
 
     Raises:
-        DataUnfit: no run carries a known payload.
+        PayloadMissing: no run carries a known payload.
     """
     require_known_payload(system)
     weight = 1.0 / tls_row_std(system, scaling)

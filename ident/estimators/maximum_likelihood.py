@@ -5,9 +5,10 @@ reference. So for each motor i, with T from the drive train (g_i v_i = (T τ)_i)
 
     v_i = γ_i (T W χ + T W_uL χ_uL + T W_kL χ_kL)_i + e_i,      γ_i = 1/g_i,     e_i ~ (0, σ_i²),
 
-and the estimate minimises Σ_i ‖e_i‖²/σ_i² with σ_i estimated along: the maximum-likelihood member
-of the paper's family. In the paper's terms it is the total least squares of eq. (17) that corrects
-the columns V only. It does not change when a current is given in another unit or the columns are
+and the estimate minimises Σ_i r_i log ‖e_i‖, the likelihood of r_i rows at the best σ_i: the
+maximum-likelihood member of the paper's family. For given σ_i its equations are those of least
+Σ_i ‖e_i‖²/σ_i². In the paper's terms it is the total least squares of eq. (17) that corrects the
+columns V only. It does not change when a current is given in another unit or the columns are
 scaled.
 """
 

@@ -36,9 +36,8 @@ import numpy as np
 from ident.arrays import FloatArray
 from ident.equations.linearisation import MIN_MOVES_TO_LEAVE_OUT, jackknife_covariance
 from ident.equations.reduction import regrouped
-from ident.equations.system import System, require_distinct
+from ident.equations.system import System, dependent_unknowns
 from ident.equations.triangles import solve
-from ident.errors import RankDeficient
 from ident.estimators.least_squares import tls
 from ident.plausible import LARGEST_GAIN_STD
 
@@ -109,9 +108,7 @@ def _missing(system: System) -> QuickGains | None:
     has_weight = [bool(np.any(factor[:, -1])) for factor in system.motors.factors]
     if not any(has_weight):
         return QuickGains(None, None, Unknown.NO_PAYLOAD)
-    try:
-        require_distinct(system, gains=False)
-    except RankDeficient:
+    if dependent_unknowns(system, gains=True):
         return QuickGains(None, None, Unknown.NOT_DISTINGUISHED)
     currents = np.abs(system.currents.drive).sum(axis=0)
     dead = tuple(np.flatnonzero(currents == 0.0).tolist())

@@ -1062,6 +1062,10 @@ WITH_ROBOT = lax.robot_from_urdf
             "draws of the gates is 9.5; expected a whole number",
         ),
         (
+            lambda a: _searched(a, gates=ident.Gates(draws=50)),
+            "draws of the gates is 50, .* false_alarm is 0.01; expected at least 99 draws; 999 is",
+        ),
+        (
             lambda a: _searched(a, progress="print"),
             "progress is of type str; expected a function of one text; write progress=print",
         ),

@@ -23,7 +23,17 @@ from ident.effects.dictionary import EFFECTS
 from ident.effects.effect import PlacedEffect
 from ident.effects.friction import AsymmetricViscous, Stribeck
 from ident.effects.position import Spring
-from tests.ident.recordings import MOUNTED, Truth, acting_on, bent, gathered, record, with_current
+from ident.model.model import DriveTrain
+from tests.ident.recordings import (
+    MOUNTED,
+    RATIO,
+    Truth,
+    acting_on,
+    bent,
+    gathered,
+    record,
+    with_current,
+)
 
 pytestmark = pytest.mark.slow
 
@@ -291,3 +301,17 @@ def test_the_change_is_zero_for_the_same_model(sticking: Evidence) -> None:
     assert change.total.rise == 0.0
     assert len(change.motors) == 3
     assert np.all(change.before > 0.0)
+
+
+def test_the_motor_that_must_confirm_an_effect_is_that_of_its_joint() -> None:
+    """Motors may be numbered in another order than joints; coupled ones keep their own joint."""
+    permuted = np.zeros((3, 3))
+    permuted[0, 1] = 40.0  # motor 1 turns joint 2
+    permuted[1, 2] = 50.0
+    permuted[2, 0] = 45.0
+    motors = [acceptance._own_motor(one, DriveTrain(permuted)) for one in (STICKING, SPRING)]
+    assert motors == [0, 1]
+    sixth = PlacedEffect(Spring(), 5)
+    assert acceptance._own_motor(sixth, DriveTrain(RATIO)) == 5
+    passive = PlacedEffect(Spring(), 6)
+    assert acceptance._own_motor(passive, DriveTrain(RATIO)) is None

@@ -15,6 +15,7 @@ from scipy import linalg
 from ident.data.dataset import Dataset
 from ident.discovery import gates, joining, loop
 from ident.discovery.candidates import SearchProblem, score_candidates
+from ident.discovery.error_change import ErrorChange
 from ident.discovery.evidence import Evidence, gather, with_effects
 from ident.discovery.few_moves import FEWEST_MOVES, moves_behind
 from ident.discovery.gates import (
@@ -428,7 +429,7 @@ def test_what_only_moves_of_the_same_run_predict_is_refused(
     assert trial is not None
     error = folds.square_sum(folds.residual)
     assert trial.left_out.sum() < 0.9 * error.sum()
-    refusal = PartsLeftOut.of(problem).refusal(columns)
+    refusal = PartsLeftOut.of(problem).refusal(columns, trial.coefficients)
     assert bool(refusal) == (powers == 3)
 
 
@@ -695,7 +696,32 @@ def test_what_holds_in_one_region_alone_is_refused(small: Evidence) -> None:
     assert trial is not None
     error = folds.square_sum(folds.residual)
     assert trial.left_out.sum() < 0.9 * error.sum()
-    assert differing.refusal(powers)
+    assert differing.refusal(powers, trial.coefficients)
+
+
+def test_the_unit_of_a_coefficient_does_not_choose_the_motor_that_must_improve(
+    small: Evidence, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Friction of two joints in one effect, most of it of the second one."""
+    problem = search_problem_of(small)
+    parts = PartsLeftOut.of(problem)
+    first = whitened_columns(problem, Stribeck(100.0), 0)
+    second = whitened_columns(problem, Stribeck(100.0), 1)
+    columns = np.column_stack((first, second))
+    coefficients = np.array([0.1, 10.0])
+    asked: list[int | None] = []
+
+    def is_no_fall(change: ErrorChange, motor: int | None = None) -> bool:
+        asked.append(motor)
+        return False
+
+    monkeypatch.setattr(ErrorChange, "harm", lambda change, data: "")
+    monkeypatch.setattr(ErrorChange, "is_enough", True)
+    monkeypatch.setattr(ErrorChange, "is_fall", is_no_fall)
+    for unit in (1.0, 1e3):
+        units = np.array([unit, 1.0])
+        parts.refusal(columns * units, coefficients / units)
+    assert asked == [1, 1]
 
 
 def test_an_effect_that_the_reported_sigma_does_not_show_leaves(sticking: Evidence) -> None:

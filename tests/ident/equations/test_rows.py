@@ -9,7 +9,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from ident.arrays import BoolArray, FloatArray
-from ident.data.conditioning import Decimator, decimator
+from ident.data.conditioning import Decimator, decimator, torque_rows
 from ident.data.dataset import Dataset, differentiate
 from ident.data.run import Run
 from ident.equations.rows import at_rows, chunks, motor_columns, row_filter, row_masks
@@ -118,6 +118,30 @@ def test_a_wrong_current_of_a_motor_that_drives_another_joint_takes_the_rows_of_
     assert not use[1][seen].any()
     assert use[2].all()
     assert motor_use[2].all()
+
+
+def test_no_row_behind_a_filtered_current_has_torques_of_unknown_positions(
+    small_truth: Truth, data: Dataset
+) -> None:
+    filtered = replace(SMALL, current_cutoff_hz=3.0)
+    everywhere = np.ones_like(data.valid)
+    moving = replace(data, valid=everywhere, moving=everywhere, motor_moving=everywhere)
+    first = 3000
+    last = first + round(0.3 * data.rate_hz)
+    valid = everywhere.copy()
+    valid[first:last] = False
+    of_torque = torque_rows(data.rate_hz, filtered)
+    changed = of_torque(np.where(valid[:, 0], 0.0, 1.0))
+    use, motor_use = row_masks(small_truth.model, replace(moving, valid=valid), filtered)
+    assert not use[:, np.abs(changed) > 0.0].any()
+    assert not motor_use[:, np.abs(changed) > 0.0].any()
+    assert use[:, np.abs(changed) == 0.0].any()
+    # A current that is wrong by itself stays out of its own window alone.
+    valid = everywhere.copy()
+    valid[first:last, 1] = False
+    use, _ = row_masks(small_truth.model, replace(moving, valid=valid), filtered)
+    assert use[0].all()
+    assert use[1, np.abs(changed) > 0.0].any()
 
 
 def test_a_motor_at_rest_has_no_row_while_its_joint_moves(

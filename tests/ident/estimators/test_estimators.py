@@ -52,6 +52,21 @@ def test_fixed_gains_give_the_classical_identification(
         assert np.all(estimate.gains_std == 0.0)
 
 
+@pytest.mark.parametrize("method", [Method.WLS, Method.ML])
+def test_with_fixed_gains_a_known_payload_need_not_be_distinguished(
+    truth: Truth, method: Method
+) -> None:
+    """A loaded run alone gives the parameters of the robot where all of the payload is known."""
+    known = Payload("disc", "a", PAYLOAD_TRUTH)
+    rng = np.random.default_rng(11)
+    loaded = record(truth, "loaded", rng, known)
+    found = identify(truth.model, [loaded], CONDITIONING, method=method, fixed_gains=GAINS)
+    expected = found.system.base.grouping @ truth.parameters
+    assert found.estimate.parameters == pytest.approx(expected, rel=1e-3, abs=2e-3)
+    with pytest.raises(RankDeficient, match="without load too"):
+        identify(truth.model, [loaded], CONDITIONING, method=method)
+
+
 def test_ml_and_the_papers_tls_beat_wls(noisy_found: Identification) -> None:
     methods = (Method.LS, Method.WLS, Method.TLS, Method.ML)
     errors = {

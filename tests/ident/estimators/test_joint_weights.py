@@ -1,4 +1,4 @@
-"""Weights of the rows of each joint: eq. (22) and §3.3 for `tls`, §2.2 for `wls`."""
+"""Weights of the rows of each joint: eq. (22) and §3.3 for `tls`, §2.3 for `wls`."""
 
 from __future__ import annotations
 

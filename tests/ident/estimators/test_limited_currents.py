@@ -10,13 +10,15 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from ident.data.dataset import Dataset
 from ident.data.run import Run
-from ident.errors import Diagnosis
+from ident.errors import Diagnosis, RankDeficient
 from ident.estimators.diagnosis import diagnose
 from ident.estimators.estimate import Identification
 from ident.estimators.identify import identify
+from ident.estimators.limited_currents import LimitedCurrent
 from tests.ident.mistaken import AXES, SMALL, small_recordings
-from tests.ident.recordings import three_axes_truth
+from tests.ident.recordings import MOUNTED, three_axes_truth
 
 TRUTH = three_axes_truth()
 AXIS = 1
@@ -122,3 +124,17 @@ def test_a_held_out_run_decides_no_sample_of_the_fit(runs: list[Run]) -> None:
     alone = identify(TRUTH.model, used, SMALL, axes=AXES, keep_rows=True)
     assert_allclose(found.estimate.gains, alone.estimate.gains, rtol=1e-12)
     assert np.isnan(found.channels[0].torque_limits).all()
+
+
+def test_what_is_left_without_limited_samples_must_distinguish_payload_and_robot(
+    runs: list[Run], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def as_if_all_that_is_left_were_loaded(data: Dataset, limits: object) -> Dataset:
+        return replace(data, payload=MOUNTED)
+
+    limit = LimitedCurrent(AXIS, 1e6)
+    identify_module = "ident.estimators.identify"
+    monkeypatch.setattr(f"{identify_module}.limited_currents", lambda *_: (limit,))
+    monkeypatch.setattr(f"{identify_module}.without_limited", as_if_all_that_is_left_were_loaded)
+    with pytest.raises(RankDeficient, match="without load too"):
+        fitted(runs)
