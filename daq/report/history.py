@@ -20,7 +20,7 @@ from daq.config.cell import Cell
 from daq.errors import ControllerUnfit, counted
 from daq.formats.document import decode_document, read_controller_file
 from daq.formats.scalar import Scalar, rewrite_gain
-from daq.ledger.audit import BACKUPS_WITHOUT_LOG, Content, head_file
+from daq.ledger.audit import BACKUPS_WITHOUT_LOG, Content, OpenWrite, head_file
 from daq.ledger.fold import Entry, Event, History, WriteAction
 from daq.ledger.ledger import Verification
 from daq.ledger.names import drives_of
@@ -412,6 +412,22 @@ def _history_axis(series: Series) -> HistoryAxis:
     )
 
 
+def _unended_text(write: OpenWrite) -> str:
+    """Say that a write was never ended, and what its file has."""
+    begun = write.begun
+    subject = printable(begun.subject)
+    found = f"{subject} was found {write.content.value}"
+    if write.content is Content.UNKNOWN:
+        found = (
+            f"what is in {subject} is not known: a file that cannot be read, drives, which are "
+            "not asked here, or an entry without digests"
+        )
+    return (
+        f"Line of entry {begun.number}: {begun.action.value} by {printable(begun.who)} at "
+        f"{begun.at} was never ended; {found}."
+    )
+
+
 def say_verification(found: Verification, console: Console) -> None:
     """Print the state of audit log and history; flaws are in the error."""
     verdict = found.verdict
@@ -435,19 +451,8 @@ def say_verification(found: Verification, console: Console) -> None:
             console.print(
                 f"Unfinished lines, left by a writer that was killed: {lines}. They are no flaw."
             )
-    for one in verdict.open_writes:
-        begun = one.begun
-        subject = printable(begun.subject)
-        found = f"{subject} was found {one.content.value}"
-        if one.content is Content.UNKNOWN:
-            found = (
-                f"what is in {subject} is not known: a file that cannot be read, drives, which are "
-                "not asked here, or an entry without digests"
-            )
-        console.print(
-            f"Line of entry {begun.number}: {begun.action.value} by {printable(begun.who)} at "
-            f"{begun.at} was never ended; {found}."
-        )
+    for write in verdict.open_writes:
+        console.print(_unended_text(write))
     for entry in verdict.entries:
         count = entry.details.get(BACKUPS_WITHOUT_LOG)
         if isinstance(count, int):

@@ -915,7 +915,7 @@ def test_a_rollback_behind_a_write_that_was_not_made_leaves_the_write_before(
         write_record(record_folder(cell), cell.name, NOW, "T", record_without_write)
         with (
             network_of(cell, address) as network,
-            pytest.raises(CalibrationRefused, match="begun by T at .*nothing needs to be undone"),
+            pytest.raises(CalibrationRefused, match=r"begun by T at .*nothing needs to be undone"),
         ):
             rollback(DriveTarget(cell, network), NOW)
         assert _gains(simulation) == NEW
