@@ -225,6 +225,15 @@ def _hold_faults(
             yield Fault(("hold", name), found, f"{allowed}, the limits in the URDF")
 
 
+def bundle_digest(files: Mapping[str, bytes]) -> str:
+    """Return the `Cell.digest` of the cell that a bundle describes.
+
+    The EDS files are not in it: they check a profile, and no cell depends on them.
+    """
+    used = {name: content for name, content in files.items() if not name.endswith(".eds")}
+    return digest(used)
+
+
 def digest(files: Mapping[str, bytes]) -> str:
     """Return the sha256 over names and contents, in the order of the names, hex."""
     total = hashlib.sha256()

@@ -9,6 +9,7 @@ is blamed.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -64,16 +65,21 @@ def look_at_block(cell: Cell, log: Path, earlier: Sequence[Path]) -> BlockFacts:
     Args:
         cell: of the session.
         log: of the block.
-        earlier: logs that all carry the same; without any, nothing is weighed.
+        earlier: logs that all carry the same; without any that can be read, nothing is weighed.
     """
     try:
         run, _ = load_run(log, cell)
-        others = [load_run(one, cell)[0] for one in earlier]
     except DataError as error:
         return BlockFacts(unreadable=f"{error.found}: {error.remedy}")
     saturated: tuple[float, ...] = ()
     if run.recording is not None:
         saturated = run.recording.saturated_percent
+    others = []
+    for earlier_log in earlier:
+        # An earlier log that cannot be read is no mistake of this block: it is left out.
+        with contextlib.suppress(DataError):
+            other, _ = load_run(earlier_log, cell)
+            others.append(other)
     if not others:
         return BlockFacts(saturated_percent=saturated)
     try:

@@ -265,7 +265,11 @@ class UntilPrecise:
             turned = context.tools.geometry(context.cell, logs)
             _refuse_geometry(() if turned is None else (turned,))
         context.journal.say(Level.WARNING, "mistake in a block", block=last.name, text=mistake.text)
-        if not context.operator.record_again(_planned(session, last), mistake.blocks, mistake.text):
+        # A block that no fit can use is not kept: with it, the session could not go on.
+        is_again = bool(facts.unreadable) or context.operator.record_again(
+            _planned(session, last), mistake.blocks, mistake.text
+        )
+        if not is_again:
             context.journal.say(Level.NOTICE, "kept as it is", block=last.name)
             return session.update(checked_blocks=recorded)
         repeated = (*state.repeated, *mistake.blocks)

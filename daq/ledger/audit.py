@@ -884,14 +884,23 @@ def open_writes(
 def unmade_write(verdict: AuditVerdict, subject: str) -> AuditEntry | None:
     """Return the last write to a file or to drives where it was begun and not made; else None.
 
+    A write that has failed counts where the content from before it was in place then.
+
     Args:
         verdict: of `verify`, which has read the file.
         subject: as the audit log names it.
     """
     begun = [one for one in verdict.entries if one.action in _BEGUN and one.subject == subject]
+    if not begun:
+        return None
+    last = begun[-1]
     unmade = [one.begun for one in verdict.open_writes if one.content is Content.BEFORE]
-    if begun and begun[-1] in unmade:
-        return begun[-1]
+    if last in unmade:
+        return last
+    for one in verdict.entries:
+        has_failed = one.action is AuditAction.FAILED and begun_by(one) == last.number
+        if has_failed and one.details.get("sha256_found") == _digest_before(last):
+            return last
     return None
 
 

@@ -22,11 +22,11 @@ from daq.config.cell_buses import (
     polling_fits,
     polling_warnings,
 )
-from daq.config.cell_file import bundle
+from daq.config.cell_file import bundle, bundle_digest
 from daq.config.drive import shipped_profiles
 from daq.config.policy import Permission
 from daq.environment import software
-from daq.errors import ControllerUnfit, DiskSpaceShort
+from daq.errors import ConfigurationInconsistent, ControllerUnfit, DiskSpaceShort
 from daq.files import sha256
 from daq.formats.document import read_controller_file
 from daq.log.conversion import SiScaling, scaling
@@ -201,6 +201,8 @@ def record(
         NotReleased: the interlock does not release the robot; nothing has moved.
         DiskSpaceShort: before the run, nothing has moved; during it, the axes were stopped, and the
             log is complete but marked invalid.
+        ConfigurationInconsistent: the cell file is not the one that `request.cell` was read from;
+            no file was made, and nothing has moved.
         ConfigurationInconsistent, OutputFailed: see daq/errors.py.
         DriverError: from the bus; the axes were stopped. The samples until then stay in an
             unfinished log (`.part`). No fit reads it; `daq.log.salvage` converts it to a partial
@@ -228,7 +230,7 @@ def record(
         )
         scale = scaling(cell, readback)
         rate_hz = 1e6 / _sync(cell).period_us
-        files = bundle(request.cell_file)
+        files = _files_of_cell(request)
         # Read the positions first, so that a refusal comes before a file exists. A stream of their
         # own reads them: once the recording's stream runs, it must be read every period, and the
         # checks below last many periods.
@@ -347,6 +349,27 @@ def _run_info(request: RecordingRequest, rate_hz: float, clocks: Clocks) -> RunI
         speed=request.speed,
         entered_kg=request.entered_kg,
         controller_sha256=digest,
+    )
+
+
+def _files_of_cell(request: RecordingRequest) -> dict[str, bytes]:
+    """Read the files of the cell for the log.
+
+    Raises:
+        ConfigurationInconsistent: the cell file was changed since the cell was read from it: the
+            log would describe another cell than the one that moves.
+    """
+    files = bundle(request.cell_file)
+    found = bundle_digest(files)
+    expected = request.cell.digest
+    if found == expected:
+        return files
+    raise ConfigurationInconsistent(
+        str(request.cell_file),
+        found=f"another content (digest {found[:12]}) than when this command read it",
+        expected=f"the cell that the moves were checked for (digest {expected[:12]})",
+        remedy="nothing has moved, and no log was made; start the command again with the new "
+        "content, or put the old one back; blocks of a guided session go on with the old one alone",
     )
 
 

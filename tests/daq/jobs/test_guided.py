@@ -15,6 +15,7 @@ from functools import partial
 from html import escape
 from itertools import count, pairwise
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -34,6 +35,7 @@ from daq.errors import (
     CalibrationRefused,
     ConfigurationError,
     ConfigurationInconsistent,
+    DataError,
     ExitCode,
     JobHeld,
     NotReleased,
@@ -1135,6 +1137,47 @@ def test_a_person_may_keep_a_block_with_a_mistake(
     operator = person(rig, monkeypatch, lines(typed))
     assert run_session(rig, operator).outcome is Outcome.APPLIED
     assert len(scale.looked) == len(FIRST_BLOCKS)
+
+
+def test_a_block_that_no_fit_can_use_is_recorded_again_without_a_question(
+    tmp_path: Path, made_session: MadeSession, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Kept, it would end every fit of the session."""
+    folder = tmp_path / "cell"
+    rig = made_session_rig(folder, made_session)
+    look = rig.tools.look
+    looked: list[Path] = []
+
+    def unreadable_at_first(cell: Cell, log: Path, earlier: Sequence[Path]) -> BlockFacts:
+        looked.append(log)
+        if len(looked) == 1:
+            return BlockFacts(unreadable="a jump of 3 rad: see to the encoder")
+        return look(cell, log, earlier)
+
+    rig.tools = replace(rig.tools, look=unreadable_at_first)
+    typed = [*ENTER, *ENTER, *WEIGHED, *ENTER, *ENTER, "yes", *ENTER]
+    operator = person(rig, monkeypatch, lines(typed))
+    assert run_session(rig, operator).outcome is Outcome.APPLIED
+    assert len(looked) == len(FIRST_BLOCKS) + 1
+    assert looked[0] == looked[1]
+
+
+def test_an_earlier_log_that_cannot_be_read_is_no_mistake_of_a_sound_block(
+    tmp_path: Path, made_session: MadeSession, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig = made_session_rig(tmp_path / "cell", made_session)
+    sound = tmp_path / "sound.mcap"
+    torn = tmp_path / "torn.mcap"
+
+    def load(log: Path, _cell: Cell) -> tuple[SimpleNamespace, None]:
+        if log == torn:
+            raise DataError(str(log), found="torn", expected="a log", remedy="record it again")
+        return SimpleNamespace(recording=None), None
+
+    monkeypatch.setattr("daq.jobs.block_check.load_run", load)
+    facts = look_at_block(rig.cell, sound, [torn])
+    assert facts.unreadable == ""
+    assert look_at_block(rig.cell, torn, [sound]).unreadable != ""
 
 
 def test_the_moves_show_what_is_on_the_flange(whole_session: tuple[Rig, MadeSession]) -> None:

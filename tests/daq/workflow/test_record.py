@@ -22,7 +22,7 @@ import pytest
 from daq.cli.app import main
 from daq.config.cell import Cell
 from daq.config.cell_file import bundle, load_cell
-from daq.errors import ExitCode, OutputFailed, RunInvalid
+from daq.errors import ConfigurationInconsistent, ExitCode, OutputFailed, RunInvalid
 from daq.log.conversion import load_run
 from daq.log.queued_file import QueuedFile
 from daq.log.reader import read_log
@@ -203,6 +203,23 @@ def test_what_is_done_before_the_first_sample_costs_no_period(
     samples = read_log(timed.out).samples
     time_steps_ns = np.diff(samples.time_ns)
     assert set(time_steps_ns) == {PERIOD_NS}
+
+
+def test_a_cell_file_that_was_changed_since_it_was_read_is_refused_before_anything_moves(
+    lockstep: Rig,
+) -> None:
+    """Somebody saves it while the operator is at the prompt: a comment makes another digest."""
+
+    def edit_at_first() -> None:
+        content = lockstep.cell_file.read_text()
+        lockstep.cell_file.write_text(content + "# J3 was slower\n")
+
+    with pytest.raises(
+        ConfigurationInconsistent, match=r"another content .* than when this command read it"
+    ):
+        lockstep.run(require_released=edit_at_first)
+    assert not lockstep.out.exists()
+    assert lockstep.profiles() == []
 
 
 @pytest.mark.slow

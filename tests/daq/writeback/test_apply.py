@@ -5,6 +5,7 @@ The gates are in test_gates.py.
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import hashlib
 import itertools
@@ -490,6 +491,31 @@ def test_a_write_that_was_never_made_is_not_rolled_back_in_the_place_of_another(
         apply(_propose(demo_calibration(), controller), NOW, audit=audit, who="bert")
         rollback(FileTarget(controller), NOW, audit=audit, who="bert")
         assert controller.read_bytes() == before
+
+
+def test_a_write_that_failed_is_not_rolled_back_in_the_place_of_another(
+    controller: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    audit = tmp_path / "audit.jsonl"
+    apply(_propose(demo_calibration(), controller), NOW, audit=audit, who="anna")
+    before = controller.read_bytes()
+    other = demo_calibration()
+    first, *others = other.gains
+    higher = replace(first, value=1.01 * first.value)
+    proposal = _propose(replace(other, gains=(higher, *others)), controller)
+    assert proposal.refusals == ()
+
+    def refuse(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, "no space")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("daq.writeback.file_target.replace_file", refuse)
+        with pytest.raises((OSError, OutputFailed)):
+            apply(proposal, NOW, audit=audit, who="bert")
+    assert read(audit)[-1].action is AuditAction.FAILED
+    with pytest.raises(CalibrationRefused, match=r"begun by bert .* that was not made"):
+        rollback(FileTarget(controller), NOW, audit=audit, who="bert")
+    assert controller.read_bytes() == before
 
 
 def test_a_rollback_that_was_never_made_is_made_by_the_next_one(
