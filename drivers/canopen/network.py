@@ -66,6 +66,8 @@ from drivers.profiles.profile import Axis, Identity
 ASKED_AT_ONCE = 8  #: Candidates for the recorder's node id that are tried together
 #: The recorder takes the highest free id: this one or a higher one on any usual bus
 LOWEST_USUAL_ID = 112
+#: Of other buses or misplaced nodes, behind which the axes of the buses that are left are stopped
+FAILURES_OF_A_STOP = 3
 REQUESTS_WHILE_CLOSING = 2  #: To each node that is asked whether it answers
 SECOND_ANSWER_S = 0.05  #: For the answer of a second device with one node id
 #: An encoder at rest flickers, and an axis may sink onto its brake between two readings
@@ -696,7 +698,7 @@ class CanopenNetwork:
         self.begin_closing()
         problems: list[DriverError] = []
         axes = [axis for axis in self.axes if axis.node_id in self._setups]
-        for _ in range(2):
+        for _ in range(FAILURES_OF_A_STOP + 1):
             try:
                 # One time limit for all: asked in turn, six dead nodes would take a minute and
                 # more.

@@ -44,7 +44,14 @@ from drivers.canopen.pdo import (
 )
 from drivers.canopen.scale import ScaleReading
 from drivers.canopen.sdo import NO_SUCH_OBJECT, ObjectAccess
-from drivers.errors import BusError, DriverError, ObjectAccessError, SetupRefused, StateRefused
+from drivers.errors import (
+    BusError,
+    DriverError,
+    NodeMisplaced,
+    ObjectAccessError,
+    SetupRefused,
+    StateRefused,
+)
 from drivers.profiles.profile import Axis, DriveProfile, Identity, ObjectEntry
 
 HEARTBEAT_TIME = ObjectEntry(0x1017, 0, 16)
@@ -77,15 +84,16 @@ Consumers = tuple[tuple[ObjectEntry, int], ...]
 def try_twice(step: Callable[[], object], problems: list[DriverError]) -> None:
     """Do a step of closing a network, once more if the bus fails during it.
 
-    A controller that goes off the bus, or the failure of one of several buses, is reported at any
-    time, and the step may still be possible. The report is appended to `problems` once.
+    A controller that goes off the bus, the failure of one of several buses, or a misplaced node is
+    reported at any time, and the step may still be possible. The report is appended to `problems`
+    once.
 
     Raises:
         DriverError: of the step; BusError if the bus failed again.
     """
     try:
         step()
-    except BusError as problem:
+    except (BusError, NodeMisplaced) as problem:
         if str(problem) not in map(str, problems):
             problems.append(problem)
         step()

@@ -22,6 +22,7 @@ from drivers.errors import (
     BusError,
     DriverError,
     MotionRefused,
+    NodeMisplaced,
     NodeMissing,
     ObjectAccessError,
     SetupRefused,
@@ -746,7 +747,7 @@ def test_one_bus_that_fails_while_the_network_closes_does_not_leave_the_other_ax
     if times > 1:  # nothing more is tried
         assert states == [0x27, 0x27]
         assert modes == [1, 1]
-        assert reported == 2
+        assert reported == 4
     else:
         assert states == [0x40, 0x40]
         assert modes == [8, 8]
@@ -832,6 +833,61 @@ def test_an_adapter_that_cannot_be_closed_is_an_error_of_the_bus(
         network.prepare()
     with pytest.raises(BusError, match="is not open"):
         network.prepare()
+
+
+def failing_with(
+    bus: ScriptedBus, failures: list[DriverError]
+) -> Callable[[can.Message, float | None], None]:
+    """Return `send` of a bus of which each SDO request meets one of these failures first."""
+    send = bus.send
+
+    def fail(msg: can.Message, timeout: float | None = None) -> None:
+        if is_request(msg) and failures:
+            raise failures.pop()
+        send(msg, timeout)
+
+    return fail
+
+
+def test_several_failures_while_the_network_closes_do_not_leave_a_good_bus_with_power(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    network, bus = cell(2)
+    failures: list[DriverError] = [
+        NodeMisplaced(9, "A", "B"),
+        BusError("bus C", "no answer"),
+        BusError("bus B", "bus-off"),
+    ]
+    with pytest.raises(BusError, match="bus B: bus-off") as error, network:
+        network.prepare()
+        for node in bus.nodes:
+            node.statusword = 0x0227
+        monkeypatch.setattr(bus, "send", failing_with(bus, failures))
+    assert [node.statusword & 0x6F for node in bus.nodes] == [0x40, 0x40]
+    assert [node.value(0x6060, 0) for node in bus.nodes] == [8, 8]
+    notes = " ".join(error.value.__notes__)
+    assert "bus C: no answer" in notes
+    assert "node 9 is heard on bus B" in notes
+
+
+def test_a_misplaced_node_that_is_heard_while_an_axis_is_disabled_does_not_end_that(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    network, bus = cell(2)
+    disable = network.disable
+    failures: list[DriverError] = [NodeMisplaced(9, "A", "B")]
+
+    def fail_once(axis: Axis, ramp_end_ns: int) -> None:
+        if failures:
+            raise failures.pop()
+        disable(axis, ramp_end_ns=ramp_end_ns)
+
+    with pytest.raises(NodeMisplaced), network:
+        network.prepare()
+        bus.nodes[0].quick_stop_stays = True
+        bus.nodes[0].statusword = 0x0227
+        monkeypatch.setattr(network, "disable", fail_once)
+    assert bus.nodes[0].statusword & 0x6F == 0x40
 
 
 @dataclass(frozen=True)
