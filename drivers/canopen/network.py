@@ -479,9 +479,10 @@ class CanopenNetwork:
         """
         for node_id, setup in self._setups.items():
             if node_id not in self.link.silent:
-                # A failure is tried again, and reported, when the network closes.
-                with suppress(DriverError):
-                    setup.guard.disarm()
+                for _, restore in setup.guard.restoring():
+                    # A failure is tried again, and reported, when the network closes.
+                    with suppress(DriverError):
+                        restore()
         self.link.stop_heartbeat()
 
     def unguarded(self) -> tuple[str, ...]:
@@ -746,7 +747,7 @@ class CanopenNetwork:
             if asked_again():
                 cause = "asked a second time"
             else:
-                cause = "some did not answer, the bus failed, or the time limit was over"
+                cause = "refused, no answer, a failure of the bus, or the time limit was over"
             not_restored = {name: ", ".join(steps) for name, steps in left.items() if steps}
             names = "; ".join(f"{name}: {steps}" for name, steps in not_restored.items())
             remedy = "switch these drives off and on before they are used"

@@ -353,12 +353,13 @@ class HeartbeatGuard:
             return error.reason
         return ""
 
-    def disarm(self) -> None:
-        """Restore the original values."""
-        if self._consumer is not None:
-            self._access.write(self._consumer, self._consumer_before)
-            if self._option_before is not None:
-                self._access.write(ABORT_CONNECTION, self._option_before)
+    def restoring(self) -> Iterator[tuple[str, Callable[[], object]]]:
+        """Yield the steps that restore the original values, and their names."""
+        if self._consumer is None:
+            return
+        yield "1016h", partial(self._access.write, self._consumer, self._consumer_before)
+        if self._option_before is not None:
+            yield "6007h", partial(self._access.write, ABORT_CONNECTION, self._option_before)
 
 
 class AxisSetup:
@@ -563,8 +564,8 @@ class AxisSetup:
     def restore(self, problems: list[DriverError]) -> tuple[str, ...]:
         """Restore all settings; returns the names of those that are left.
 
-        They are left when the amplifier falls silent, when the time for closing is over, or when
-        the bus fails again and again. Failures are appended to `problems`.
+        They are left when the amplifier refuses them or falls silent, when the time for closing is
+        over, or when the bus fails again and again. Failures are appended to `problems`.
         """
         steps = list(self._restoring())
         unreached: list[str] = []
@@ -583,6 +584,7 @@ class AxisSetup:
                     problems.append(problem)
                 if silent:
                     return (*unreached, *left)
+                unreached.append(name)
         return tuple(unreached)
 
     def _restoring(self) -> Iterator[tuple[str, Callable[[], object]]]:
@@ -593,7 +595,7 @@ class AxisSetup:
             if entry in self._before:
                 yield f"{entry.index:04X}h", partial(self._access.write, entry, self._before[entry])
         if not self.guard.stays:
-            yield "1016h", self.guard.disarm
+            yield from self.guard.restoring()
         if HEARTBEAT_TIME in self._before:
             yield "1017h", partial(self._access.write, HEARTBEAT_TIME, self._before[HEARTBEAT_TIME])
 

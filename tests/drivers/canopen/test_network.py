@@ -704,12 +704,14 @@ def test_preparing_twice_still_restores_the_first_settings() -> None:
 
 def test_a_step_of_restoring_that_fails_does_not_keep_the_others_from_it() -> None:
     network, bus = cell(2)
-    with pytest.raises(SetupRefused, match=r"J1 \(node 1\): TPDO1"), network:
+    with pytest.raises(SetupRefused, match=r"J1 \(node 1\): TPDO1") as refused, network:
         network.prepare()
         bus.nodes[0].aborts[0x1800, 2] = 0x06010002
     assert bus.nodes[0].value(0x1400, 2) == 255
     assert bus.nodes[0].value(0x1017, 0) == 0
     assert bus.nodes[1].value(0x1800, 2) == 255
+    notes = " ".join(refused.value.__notes__)
+    assert re.search(r"settings not restored \(.*\): J1: TPDO1; switch these drives off", notes)
 
 
 def test_an_ampere_that_cannot_be_true_is_refused_before_an_axis_has_power() -> None:
@@ -1014,7 +1016,7 @@ def test_closing_has_one_time_limit_and_names_what_it_left(asked: bool) -> None:
     assert "J2 (node 2) did not answer" in said
     if asked:
         assert "settings not restored (asked a second time): J1: TPDO1" in said
-        assert "6060h, 1016h, 1017h; switch these drives off and on" in said
+        assert "6060h, 1017h; switch these drives off and on" in said
     assert "not confirmed without power" not in said  # none of them ever had it
 
 

@@ -124,6 +124,25 @@ def test_an_amplifier_that_cannot_be_disabled_goes_on_watching_the_recorder() ->
     assert "the watch of J1 (node 1) (1016h) is not restored" in notes
 
 
+def test_the_way_of_stopping_is_restored_where_the_watch_cannot_be() -> None:
+    network, bus = guarded_cell()
+    with pytest.raises(ObjectAccessError) as refused, network:
+        network.prepare()
+        bus.nodes[0].aborts[0x1016, 1] = 0x08000022
+    assert reactions(*bus.nodes) == [1, 1]
+    assert "J1: 1016h;" in " ".join(refused.value.__notes__)
+
+
+def test_the_end_of_a_run_restores_the_way_of_stopping_where_the_watch_cannot_be() -> None:
+    network, bus = guarded_cell()
+    with pytest.raises(ObjectAccessError), network:
+        network.prepare()
+        network.guard()
+        bus.nodes[0].aborts[0x1016, 1] = 0x08000022
+        network.unguard()
+        assert reactions(*bus.nodes) == [1, 1]
+
+
 def test_an_amplifier_that_never_heard_the_recorder_gets_its_watch_back() -> None:
     network, bus = guarded_cell()
     refusing = bus.nodes[0]
