@@ -45,6 +45,7 @@ from drivers.errors import (
     BusBusy,
     BusError,
     DriverError,
+    MotionRefused,
     NodeMissing,
     ObjectAccessError,
     SetupRefused,
@@ -466,7 +467,19 @@ class CanopenNetwork:
 
         Raises:
             BusBusy: a device has come that has the same node id.
+            MotionRefused: the watch over the recorder ended with a motion before.
         """
+        ended = []
+        for axis in self.axes:
+            setup = self._setups.get(axis.node_id)
+            if setup is not None and setup.guard.is_over:
+                ended.append(axis.name)
+        if ended:
+            raise MotionRefused(
+                f"{', '.join(ended)} no longer watching the recorder: the motion before ended that",
+                expected="that every axis that can watches the recorder's heartbeat (1016h)",
+                remedy="nothing has moved; prepare the network again before another motion",
+            )
         for identifier in filter(self.link.is_own, self.link.foreign):
             raise BusBusy.by_own_id(self.link.address, identifier)
         self.link.start_heartbeat(self.recorder_id, self.heartbeat_ms)
@@ -479,10 +492,7 @@ class CanopenNetwork:
         """
         for node_id, setup in self._setups.items():
             if node_id not in self.link.silent:
-                for _, restore in setup.guard.restoring():
-                    # A failure is tried again, and reported, when the network closes.
-                    with suppress(DriverError):
-                        restore()
+                setup.guard.end()
         self.link.stop_heartbeat()
 
     def unguarded(self) -> tuple[str, ...]:

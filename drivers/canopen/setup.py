@@ -288,6 +288,7 @@ class HeartbeatGuard:
         self.lack = ""  #: Missing capability, in words; empty when nothing is missing
         self.stays = False  #: Whether its values stay when all other settings are restored
         self._access = access
+        self._is_over = False
         self._consumer: ObjectEntry | None = None
         self._consumer_before = 0
         self._option_before: int | None = None
@@ -309,7 +310,20 @@ class HeartbeatGuard:
     @property
     def watching(self) -> bool:
         """Whether the amplifier stops by itself when the recorder is killed."""
-        return self._consumer is not None
+        return self._consumer is not None and not self._is_over
+
+    @property
+    def is_over(self) -> bool:
+        """Whether the watch was taken off since it was armed."""
+        return self._consumer is not None and self._is_over
+
+    def end(self) -> None:
+        """Restore the original values as far as possible; the watch then has to be armed again."""
+        self._is_over = True
+        for _, restore in self.restoring():
+            # A failure is tried again, and reported, when the network closes.
+            with suppress(DriverError):
+                restore()
 
     def describe(self, silence_ms: int) -> str:
         """Describe the guard in words, for the log."""
@@ -326,6 +340,7 @@ class HeartbeatGuard:
 
         A refused write is reported in `lack`; the recording goes on.
         """
+        self._is_over = False
         if self._consumer is None:
             return
         if self._option_before is not None and (
