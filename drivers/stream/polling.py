@@ -20,7 +20,7 @@ import can
 from drivers.canopen.network import CanopenNetwork
 from drivers.canopen.scale import ScaleReading
 from drivers.canopen.sdo import NO_SUCH_OBJECT, upload_answer, upload_request
-from drivers.errors import BusError, ObjectAccessError
+from drivers.errors import DriverError, ObjectAccessError
 from drivers.messages import EventKind, Quantity, SlowReading
 from drivers.profiles.profile import Axis, ObjectEntry
 from drivers.stream.stream import SyncStream
@@ -117,7 +117,7 @@ class Polling:
         found = []
         for source in self._sources:
             if source.quantity is Quantity.TEMPERATURE:
-                with suppress(ObjectAccessError, BusError):
+                with suppress(DriverError):
                     raw = self._network.link.objects(source.node_id).read(source.entry)
                     found.append(
                         SlowReading(time_ns, source.axis, source.quantity, raw * source.per_unit)
