@@ -50,7 +50,6 @@ from drivers.errors import (
     NodeMisplaced,
     ObjectAccessError,
     SetupRefused,
-    StateRefused,
 )
 from drivers.profiles.profile import Axis, DriveProfile, Identity, ObjectEntry
 
@@ -547,11 +546,9 @@ class AxisSetup:
         """Select profile position mode, and wait until 6061h shows it.
 
         Raises:
-            SetupRefused: the amplifier refuses the mode, or does not show it.
-            StateRefused: 6061h does not show it in time.
+            SetupRefused: the amplifier refuses the mode, or 6061h does not show it in time.
             ObjectAccessError: the amplifier does not answer.
         """
-        access = self._access
         expected = "profile position mode (1), in which the drive makes the moves by itself"
         self._change(MODE_OF_OPERATION, PROFILE_POSITION_MODE, expected, self._mode_remedy())
         deadline = self._link.clock() + round(within_s * 1e9)
@@ -560,9 +557,11 @@ class AxisSetup:
             if shown == PROFILE_POSITION_MODE:
                 return
             if self._link.clock() >= deadline:
-                found = f"mode {shown} in 6061h"
-                raise StateRefused(
-                    self._axis, "profile position mode (1)", found, access.read(STATUSWORD)
+                raise SetupRefused(
+                    self._axis,
+                    f"found mode {shown} in 6061h, {within_s:g} s after it was asked for another",
+                    expected=expected,
+                    remedy=MODE_REMEDY,
                 )
             self._link.pass_time()
 

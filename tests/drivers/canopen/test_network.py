@@ -606,8 +606,10 @@ def test_a_drive_with_small_pdos_gets_more_of_them() -> None:
 def test_a_mode_that_is_not_taken_is_refused() -> None:
     network, bus = cell(1)
     bus.nodes[0].lies[0x6061, 0] = 8
-    with network, pytest.raises(StateRefused, match="mode 8 in 6061h"):
+    with network, pytest.raises(SetupRefused, match="mode 8 in 6061h") as refused:
         network.prepare()
+    assert "statusword" not in str(refused.value)
+    assert "choose the mode with its own tool" in str(refused.value)
 
 
 def test_a_lost_answer_is_asked_for_again_and_a_late_one_not_believed() -> None:
