@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.canopen.link import NmtState
+from drivers.canopen.link import NmtCommand, NmtState
 from drivers.canopen.network import Bounds, CanopenNetwork
 from drivers.canopen.sdo import SdoPolicy
 from drivers.errors import (
@@ -338,6 +338,17 @@ def test_a_node_that_ignores_nmt_is_refused() -> None:
     ):
         network.prepare()
     assert bus.nodes[0].value(0x1800, 2) == 255
+
+
+def test_the_wait_for_an_nmt_state_is_counted_from_its_command() -> None:
+    """It was "after 0 s" for a node that was asked behind others."""
+    network, bus = cell(1)
+    with network:
+        bus.nodes[0].obeys_nmt = False
+        since_ns = network.link.command_nmt(1, NmtCommand.START)
+        bus.clock.now_ns += 2_000_000_000
+        with pytest.raises(StateRefused, match="after 2 s"):
+            network.link.confirm_nmt(1, NmtState.OPERATIONAL, since_ns, 0.0)
 
 
 def test_a_node_without_heartbeat_cannot_confirm() -> None:
