@@ -86,9 +86,15 @@ class Polling:
                             "is not logged"
                         )
                         continue
+                    if beside_stream:
+                        next_request = "it is asked again in the run"
+                    elif quantity is Quantity.TEMPERATURE:
+                        next_request = "it is asked again after the run"
+                    else:
+                        next_request = "it is not asked again"
                     polling._remarks.append(
                         f"{axis.name}: the drive refused its {quantity.value} in {entry} at first "
-                        f"({error.reason}); it is asked again in the run"
+                        f"({error.reason}); {next_request}"
                     )
                 source = _Source(number, axis.node_id, entry, quantity, per_unit)
                 polling._sources.append(source)

@@ -260,6 +260,18 @@ def test_a_misplaced_node_that_is_heard_behind_a_run_costs_no_sample(
         assert polling.temperatures(0) == ()
 
 
+def test_an_object_that_is_refused_where_the_bus_has_no_room_is_read_after_the_run_alone(
+    bench: Bench,
+) -> None:
+    for index in (0x2005, 0x6077):
+        bench.bus.nodes[0].read_aborts[index, 0] = 0x08000022
+    remarks = Polling.found(bench.network, beside_stream=False).remarks
+    texts = " ".join(remarks)
+    assert "it is asked again after the run" in texts
+    assert "it is not asked again" in texts
+    assert "again in the run" not in texts
+
+
 def test_a_torque_without_rated_torque_has_no_unit_and_is_not_read(bench: Bench) -> None:
     for node in bench.bus.nodes:
         node.objects[0x6076, 0] = (0, 4)
