@@ -76,7 +76,7 @@ def synchronised_move(
     for the common duration, so that the end times differ only by its rounding, on the ramp alone.
 
     Raises:
-        ValueError: a limit is not above 2 counts/s or counts/s².
+        ValueError: a limit is not above 1 count/s or count/s²; it shows the limits less 1.
     """
     start = np.asarray(start_counts, dtype=np.float64)
     target = np.asarray(target_counts, dtype=np.float64)

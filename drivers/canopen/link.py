@@ -543,7 +543,8 @@ class Link:
             return self.nmt[node_id]
 
         if not self.wait(within_s, lambda: found() == state):
-            shown = f"{nmt_name(found())} after {within_s:.3g} s"
+            waited_s = (self.clock() - since_ns) * 1e-9
+            shown = f"{nmt_name(found())} after {waited_s:.3g} s"
             raise StateRefused(
                 self.objects(node_id),
                 f"NMT {state}",

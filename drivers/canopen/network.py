@@ -45,6 +45,7 @@ from drivers.errors import (
     BusBusy,
     BusError,
     DriverError,
+    MotionRefused,
     NodeMissing,
     ObjectAccessError,
     SetupRefused,
@@ -66,6 +67,8 @@ from drivers.profiles.profile import Axis, Identity
 ASKED_AT_ONCE = 8  #: Candidates for the recorder's node id that are tried together
 #: The recorder takes the highest free id: this one or a higher one on any usual bus
 LOWEST_USUAL_ID = 112
+#: Of other buses or misplaced nodes, behind which the axes of the buses that are left are stopped
+FAILURES_OF_A_STOP = 3
 REQUESTS_WHILE_CLOSING = 2  #: To each node that is asked whether it answers
 SECOND_ANSWER_S = 0.05  #: For the answer of a second device with one node id
 #: An encoder at rest flickers, and an axis may sink onto its brake between two readings
@@ -464,7 +467,19 @@ class CanopenNetwork:
 
         Raises:
             BusBusy: a device has come that has the same node id.
+            MotionRefused: the watch over the recorder ended with a motion before.
         """
+        ended = []
+        for axis in self.axes:
+            setup = self._setups.get(axis.node_id)
+            if setup is not None and setup.guard.is_over:
+                ended.append(axis.name)
+        if ended:
+            raise MotionRefused(
+                f"{', '.join(ended)} no longer watching the recorder: the motion before ended that",
+                expected="that every axis that can watches the recorder's heartbeat (1016h)",
+                remedy="nothing has moved; prepare the network again before another motion",
+            )
         for identifier in filter(self.link.is_own, self.link.foreign):
             raise BusBusy.by_own_id(self.link.address, identifier)
         self.link.start_heartbeat(self.recorder_id, self.heartbeat_ms)
@@ -477,9 +492,7 @@ class CanopenNetwork:
         """
         for node_id, setup in self._setups.items():
             if node_id not in self.link.silent:
-                # A failure is tried again, and reported, when the network closes.
-                with suppress(DriverError):
-                    setup.guard.disarm()
+                setup.guard.end()
         self.link.stop_heartbeat()
 
     def unguarded(self) -> tuple[str, ...]:
@@ -696,7 +709,7 @@ class CanopenNetwork:
         self.begin_closing()
         problems: list[DriverError] = []
         axes = [axis for axis in self.axes if axis.node_id in self._setups]
-        for _ in range(2):
+        for _ in range(FAILURES_OF_A_STOP + 1):
             try:
                 # One time limit for all: asked in turn, six dead nodes would take a minute and
                 # more.
@@ -744,7 +757,7 @@ class CanopenNetwork:
             if asked_again():
                 cause = "asked a second time"
             else:
-                cause = "some did not answer, the bus failed, or the time limit was over"
+                cause = "refused, no answer, a failure of the bus, or the time limit was over"
             not_restored = {name: ", ".join(steps) for name, steps in left.items() if steps}
             names = "; ".join(f"{name}: {steps}" for name, steps in not_restored.items())
             remedy = "switch these drives off and on before they are used"

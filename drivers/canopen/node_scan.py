@@ -37,7 +37,7 @@ class FoundNode:
     """One node of a bus, as far as it reports."""
 
     node_id: int  #: CANopen node id
-    identity: Identity | None  #: object 1018h, or None when it answers no SDO (it may be stopped)
+    identity: Identity | None  #: object 1018h, or None when it does not answer or refuses it
     revision: int | None  #: 1018h:03, or None
     device_name: str | None  #: 1008h, or None
     nmt: int | None  #: NMT state of its last heartbeat, or None when it sends none

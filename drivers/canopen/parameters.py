@@ -175,8 +175,8 @@ def recording_leftover(network: CanopenNetwork, axis: Axis) -> str:
     They are lost with the drive's power, and a save would keep them.
     """
     access = network.objects(axis)
-    # A recording sets the watch for its heartbeat first, and restores it last. Only a missing 1016h
-    # proves that there is no watch; any other refusal may hide one.
+    # A recording sets the watch before any PDO or mode. Only a missing 1016h proves that there is
+    # none; any other refusal may hide one.
     for sub in range(1, (access.read_optional(CONSUMERS) or 0) + 1):
         value = access.read_optional(ObjectEntry(CONSUMERS.index, sub, 32))
         if value is None:

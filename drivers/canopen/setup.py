@@ -44,7 +44,13 @@ from drivers.canopen.pdo import (
 )
 from drivers.canopen.scale import ScaleReading
 from drivers.canopen.sdo import NO_SUCH_OBJECT, ObjectAccess
-from drivers.errors import BusError, DriverError, ObjectAccessError, SetupRefused, StateRefused
+from drivers.errors import (
+    BusError,
+    DriverError,
+    NodeMisplaced,
+    ObjectAccessError,
+    SetupRefused,
+)
 from drivers.profiles.profile import Axis, DriveProfile, Identity, ObjectEntry
 
 HEARTBEAT_TIME = ObjectEntry(0x1017, 0, 16)
@@ -77,15 +83,16 @@ Consumers = tuple[tuple[ObjectEntry, int], ...]
 def try_twice(step: Callable[[], object], problems: list[DriverError]) -> None:
     """Do a step of closing a network, once more if the bus fails during it.
 
-    A controller that goes off the bus, or the failure of one of several buses, is reported at any
-    time, and the step may still be possible. The report is appended to `problems` once.
+    A controller that goes off the bus, the failure of one of several buses, or a misplaced node is
+    reported at any time, and the step may still be possible. The report is appended to `problems`
+    once.
 
     Raises:
         DriverError: of the step; BusError if the bus failed again.
     """
     try:
         step()
-    except BusError as problem:
+    except (BusError, NodeMisplaced) as problem:
         if str(problem) not in map(str, problems):
             problems.append(problem)
         step()
@@ -280,6 +287,7 @@ class HeartbeatGuard:
         self.lack = ""  #: Missing capability, in words; empty when nothing is missing
         self.stays = False  #: Whether its values stay when all other settings are restored
         self._access = access
+        self._is_over = False
         self._consumer: ObjectEntry | None = None
         self._consumer_before = 0
         self._option_before: int | None = None
@@ -301,7 +309,20 @@ class HeartbeatGuard:
     @property
     def watching(self) -> bool:
         """Whether the amplifier stops by itself when the recorder is killed."""
-        return self._consumer is not None
+        return self._consumer is not None and not self._is_over
+
+    @property
+    def is_over(self) -> bool:
+        """Whether the watch was taken off since it was armed."""
+        return self._consumer is not None and self._is_over
+
+    def end(self) -> None:
+        """Restore the original values as far as possible; the watch then has to be armed again."""
+        self._is_over = True
+        for _, restore in self.restoring():
+            # A failure is tried again, and reported, when the network closes.
+            with suppress(DriverError):
+                restore()
 
     def describe(self, silence_ms: int) -> str:
         """Describe the guard in words, for the log."""
@@ -318,6 +339,7 @@ class HeartbeatGuard:
 
         A refused write is reported in `lack`; the recording goes on.
         """
+        self._is_over = False
         if self._consumer is None:
             return
         if self._option_before is not None and (
@@ -345,12 +367,13 @@ class HeartbeatGuard:
             return error.reason
         return ""
 
-    def disarm(self) -> None:
-        """Restore the original values."""
-        if self._consumer is not None:
-            self._access.write(self._consumer, self._consumer_before)
-            if self._option_before is not None:
-                self._access.write(ABORT_CONNECTION, self._option_before)
+    def restoring(self) -> Iterator[tuple[str, Callable[[], object]]]:
+        """Yield the steps that restore the original values, and their names."""
+        if self._consumer is None:
+            return
+        yield "1016h", partial(self._access.write, self._consumer, self._consumer_before)
+        if self._option_before is not None:
+            yield "6007h", partial(self._access.write, ABORT_CONNECTION, self._option_before)
 
 
 class AxisSetup:
@@ -523,11 +546,9 @@ class AxisSetup:
         """Select profile position mode, and wait until 6061h shows it.
 
         Raises:
-            SetupRefused: the amplifier refuses the mode, or does not show it.
-            StateRefused: 6061h does not show it in time.
+            SetupRefused: the amplifier refuses the mode, or 6061h does not show it in time.
             ObjectAccessError: the amplifier does not answer.
         """
-        access = self._access
         expected = "profile position mode (1), in which the drive makes the moves by itself"
         self._change(MODE_OF_OPERATION, PROFILE_POSITION_MODE, expected, self._mode_remedy())
         deadline = self._link.clock() + round(within_s * 1e9)
@@ -536,9 +557,11 @@ class AxisSetup:
             if shown == PROFILE_POSITION_MODE:
                 return
             if self._link.clock() >= deadline:
-                found = f"mode {shown} in 6061h"
-                raise StateRefused(
-                    self._axis, "profile position mode (1)", found, access.read(STATUSWORD)
+                raise SetupRefused(
+                    self._axis,
+                    f"found mode {shown} in 6061h, {within_s:g} s after it was asked for another",
+                    expected=expected,
+                    remedy=MODE_REMEDY,
                 )
             self._link.pass_time()
 
@@ -555,8 +578,8 @@ class AxisSetup:
     def restore(self, problems: list[DriverError]) -> tuple[str, ...]:
         """Restore all settings; returns the names of those that are left.
 
-        They are left when the amplifier falls silent, when the time for closing is over, or when
-        the bus fails again and again. Failures are appended to `problems`.
+        They are left when the amplifier refuses them or falls silent, when the time for closing is
+        over, or when the bus fails again and again. Failures are appended to `problems`.
         """
         steps = list(self._restoring())
         unreached: list[str] = []
@@ -575,6 +598,7 @@ class AxisSetup:
                     problems.append(problem)
                 if silent:
                     return (*unreached, *left)
+                unreached.append(name)
         return tuple(unreached)
 
     def _restoring(self) -> Iterator[tuple[str, Callable[[], object]]]:
@@ -585,7 +609,7 @@ class AxisSetup:
             if entry in self._before:
                 yield f"{entry.index:04X}h", partial(self._access.write, entry, self._before[entry])
         if not self.guard.stays:
-            yield "1016h", self.guard.disarm
+            yield from self.guard.restoring()
         if HEARTBEAT_TIME in self._before:
             yield "1017h", partial(self._access.write, HEARTBEAT_TIME, self._before[HEARTBEAT_TIME])
 

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 from drivers.canopen.bus import base_frame
-from drivers.canopen.network import CanopenNetwork
+from drivers.canopen.network import FAILURES_OF_A_STOP, CanopenNetwork
 from drivers.canopen.pdo import (
     CONTROLWORD,
     PROFILE_ACCELERATION,
@@ -52,8 +52,6 @@ from drivers.stream.watch import FrozenData
 
 #: Cycles in which a controlword is sent with every SYNC; after them with every tenth
 _URGENT_CYCLES = 10
-#: Behind which a stop by SDO still begins on the buses that are left
-_FAILURES_OF_A_STOP = 3
 _NEW_SETPOINT = ControlCommand.ENABLE_OPERATION | CONTROL_NEW_SETPOINT | CONTROL_CHANGE_IMMEDIATELY
 
 
@@ -528,7 +526,7 @@ class _Execution:
         A failure of one of several buses, or a misplaced node, is raised once, and then the others
         go on. So the nodes are asked again after a failure, and those of the other buses stopped.
         """
-        for _ in range(_FAILURES_OF_A_STOP):
+        for _ in range(FAILURES_OF_A_STOP):
             try:
                 return self._network.find_silent(nodes)
             except DriverError as error:

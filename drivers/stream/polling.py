@@ -20,7 +20,7 @@ import can
 from drivers.canopen.network import CanopenNetwork
 from drivers.canopen.scale import ScaleReading
 from drivers.canopen.sdo import NO_SUCH_OBJECT, upload_answer, upload_request
-from drivers.errors import BusError, ObjectAccessError
+from drivers.errors import DriverError, ObjectAccessError
 from drivers.messages import EventKind, Quantity, SlowReading
 from drivers.profiles.profile import Axis, ObjectEntry
 from drivers.stream.stream import SyncStream
@@ -86,9 +86,15 @@ class Polling:
                             "is not logged"
                         )
                         continue
+                    if beside_stream:
+                        next_request = "it is asked again in the run"
+                    elif quantity is Quantity.TEMPERATURE:
+                        next_request = "it is asked again after the run"
+                    else:
+                        next_request = "it is not asked again"
                     polling._remarks.append(
                         f"{axis.name}: the drive refused its {quantity.value} in {entry} at first "
-                        f"({error.reason}); it is asked again in the run"
+                        f"({error.reason}); {next_request}"
                     )
                 source = _Source(number, axis.node_id, entry, quantity, per_unit)
                 polling._sources.append(source)
@@ -117,7 +123,7 @@ class Polling:
         found = []
         for source in self._sources:
             if source.quantity is Quantity.TEMPERATURE:
-                with suppress(ObjectAccessError, BusError):
+                with suppress(DriverError):
                     raw = self._network.link.objects(source.node_id).read(source.entry)
                     found.append(
                         SlowReading(time_ns, source.axis, source.quantity, raw * source.per_unit)

@@ -121,7 +121,7 @@ class FollowedSync:
     """Follow the SYNC of a producer that we started: each SYNC that is seen begins a cycle.
 
     The order of the frames on the bus decides which cycle they belong to: a late reader loses
-    nothing.
+    nothing. On a bus without stamps, its delay counts as periods that were left out.
     """
 
     period_ns: int  #: of the producer [ns]
@@ -410,7 +410,12 @@ class FollowedCycles(_CyclesByOrder):
             since_ns = at_ns - self._last_sync_ns
             periods = max(1, self._periods_in(since_ns))
             bus.skipped += periods - 1
-            if self._rate.too_fast(since_ns):
+            # Without a stamp, the reader may be late instead of the SYNC
+            if isinstance(sync, CapturedMessage):
+                latest_ns = pacing.period_ns
+            else:
+                latest_ns = LARGEST_LAG_NS
+            if self._rate.too_fast(since_ns, latest_ns):
                 bus.link.note_foreign(SYNC_COB_ID)
         if pacing.producer.in_kernel and isinstance(sync, CapturedMessage) and not sync.local:
             bus.link.note_foreign(SYNC_COB_ID)
@@ -496,7 +501,14 @@ class SyncRate:
         self._period_ns = period_ns
         self._ahead = 0.0
 
-    def too_fast(self, since_last_ns: int) -> bool:
-        """Whether a SYNC this long after the one before is one too many."""
-        self._ahead = max(-1.0, DECAY * self._ahead + 1.0 - since_last_ns / self._period_ns)
+    def too_fast(self, since_last_ns: int, latest_ns: int) -> bool:
+        """Whether a SYNC this long after the one before is one too many.
+
+        `latest_ns` is how late the one before may have been: as many may follow it at once.
+        """
+        lead = self._ahead
+        if lead >= -1.0:  # below, as many SYNCs are still to come as the reader was late
+            lead *= DECAY
+        lead += 1.0 - since_last_ns / self._period_ns
+        self._ahead = max(-latest_ns / self._period_ns, lead)
         return self._ahead > SURPLUS

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.canopen.link import NmtState
+from drivers.canopen.link import NmtCommand, NmtState
 from drivers.canopen.network import Bounds, CanopenNetwork
 from drivers.canopen.sdo import SdoPolicy
 from drivers.errors import (
@@ -22,6 +22,7 @@ from drivers.errors import (
     BusError,
     DriverError,
     MotionRefused,
+    NodeMisplaced,
     NodeMissing,
     ObjectAccessError,
     SetupRefused,
@@ -339,6 +340,17 @@ def test_a_node_that_ignores_nmt_is_refused() -> None:
     assert bus.nodes[0].value(0x1800, 2) == 255
 
 
+def test_the_wait_for_an_nmt_state_is_counted_from_its_command() -> None:
+    """It was "after 0 s" for a node that was asked behind others."""
+    network, bus = cell(1)
+    with network:
+        bus.nodes[0].obeys_nmt = False
+        since_ns = network.link.command_nmt(1, NmtCommand.START)
+        bus.clock.now_ns += 2_000_000_000
+        with pytest.raises(StateRefused, match="after 2 s"):
+            network.link.confirm_nmt(1, NmtState.OPERATIONAL, since_ns, 0.0)
+
+
 def test_a_node_without_heartbeat_cannot_confirm() -> None:
     network, bus = cell(1)
     bus.nodes[0].beats = False
@@ -605,8 +617,10 @@ def test_a_drive_with_small_pdos_gets_more_of_them() -> None:
 def test_a_mode_that_is_not_taken_is_refused() -> None:
     network, bus = cell(1)
     bus.nodes[0].lies[0x6061, 0] = 8
-    with network, pytest.raises(StateRefused, match="mode 8 in 6061h"):
+    with network, pytest.raises(SetupRefused, match="mode 8 in 6061h") as refused:
         network.prepare()
+    assert "statusword" not in str(refused.value)
+    assert "choose the mode with its own tool" in str(refused.value)
 
 
 def test_a_lost_answer_is_asked_for_again_and_a_late_one_not_believed() -> None:
@@ -703,12 +717,14 @@ def test_preparing_twice_still_restores_the_first_settings() -> None:
 
 def test_a_step_of_restoring_that_fails_does_not_keep_the_others_from_it() -> None:
     network, bus = cell(2)
-    with pytest.raises(SetupRefused, match=r"J1 \(node 1\): TPDO1"), network:
+    with pytest.raises(SetupRefused, match=r"J1 \(node 1\): TPDO1") as refused, network:
         network.prepare()
         bus.nodes[0].aborts[0x1800, 2] = 0x06010002
     assert bus.nodes[0].value(0x1400, 2) == 255
     assert bus.nodes[0].value(0x1017, 0) == 0
     assert bus.nodes[1].value(0x1800, 2) == 255
+    notes = " ".join(refused.value.__notes__)
+    assert re.search(r"settings not restored \(.*\): J1: TPDO1; switch these drives off", notes)
 
 
 def test_an_ampere_that_cannot_be_true_is_refused_before_an_axis_has_power() -> None:
@@ -746,7 +762,7 @@ def test_one_bus_that_fails_while_the_network_closes_does_not_leave_the_other_ax
     if times > 1:  # nothing more is tried
         assert states == [0x27, 0x27]
         assert modes == [1, 1]
-        assert reported == 2
+        assert reported == 4
     else:
         assert states == [0x40, 0x40]
         assert modes == [8, 8]
@@ -828,6 +844,61 @@ def test_an_adapter_that_cannot_be_closed_is_an_error_of_the_bus(
         network.prepare()
     with pytest.raises(BusError, match="is not open"):
         network.prepare()
+
+
+def failing_with(
+    bus: ScriptedBus, failures: list[DriverError]
+) -> Callable[[can.Message, float | None], None]:
+    """Return `send` of a bus of which each SDO request meets one of these failures first."""
+    send = bus.send
+
+    def fail(msg: can.Message, timeout: float | None = None) -> None:
+        if is_request(msg) and failures:
+            raise failures.pop()
+        send(msg, timeout)
+
+    return fail
+
+
+def test_several_failures_while_the_network_closes_do_not_leave_a_good_bus_with_power(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    network, bus = cell(2)
+    failures: list[DriverError] = [
+        NodeMisplaced(9, "A", "B"),
+        BusError("bus C", "no answer"),
+        BusError("bus B", "bus-off"),
+    ]
+    with pytest.raises(BusError, match="bus B: bus-off") as error, network:
+        network.prepare()
+        for node in bus.nodes:
+            node.statusword = 0x0227
+        monkeypatch.setattr(bus, "send", failing_with(bus, failures))
+    assert [node.statusword & 0x6F for node in bus.nodes] == [0x40, 0x40]
+    assert [node.value(0x6060, 0) for node in bus.nodes] == [8, 8]
+    notes = " ".join(error.value.__notes__)
+    assert "bus C: no answer" in notes
+    assert "node 9 is heard on bus B" in notes
+
+
+def test_a_misplaced_node_that_is_heard_while_an_axis_is_disabled_does_not_end_that(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    network, bus = cell(2)
+    disable = network.disable
+    failures: list[DriverError] = [NodeMisplaced(9, "A", "B")]
+
+    def fail_once(axis: Axis, ramp_end_ns: int) -> None:
+        if failures:
+            raise failures.pop()
+        disable(axis, ramp_end_ns=ramp_end_ns)
+
+    with pytest.raises(NodeMisplaced), network:
+        network.prepare()
+        bus.nodes[0].quick_stop_stays = True
+        bus.nodes[0].statusword = 0x0227
+        monkeypatch.setattr(network, "disable", fail_once)
+    assert bus.nodes[0].statusword & 0x6F == 0x40
 
 
 @dataclass(frozen=True)
@@ -954,7 +1025,7 @@ def test_closing_has_one_time_limit_and_names_what_it_left(asked: bool) -> None:
     assert "J2 (node 2) did not answer" in said
     if asked:
         assert "settings not restored (asked a second time): J1: TPDO1" in said
-        assert "6060h, 1016h, 1017h; switch these drives off and on" in said
+        assert "6060h, 1017h; switch these drives off and on" in said
     assert "not confirmed without power" not in said  # none of them ever had it
 
 

@@ -8,7 +8,7 @@ import can
 import pytest
 
 from drivers.canopen.network import CanopenNetwork
-from drivers.errors import BusBusy, MotionTimeout, ObjectAccessError, SetupRefused
+from drivers.errors import BusBusy, MotionRefused, MotionTimeout, ObjectAccessError, SetupRefused
 from drivers.messages import CellEvent, EventKind
 from drivers.motion.execute import execute
 from drivers.move import Move
@@ -122,6 +122,41 @@ def test_an_amplifier_that_cannot_be_disabled_goes_on_watching_the_recorder() ->
     assert refusing.value(0x6060, 0) == 8
     notes = " ".join(failure.value.__notes__)
     assert "the watch of J1 (node 1) (1016h) is not restored" in notes
+
+
+def test_the_way_of_stopping_is_restored_where_the_watch_cannot_be() -> None:
+    network, bus = guarded_cell()
+    with pytest.raises(ObjectAccessError) as refused, network:
+        network.prepare()
+        bus.nodes[0].aborts[0x1016, 1] = 0x08000022
+    assert reactions(*bus.nodes) == [1, 1]
+    assert "J1: 1016h;" in " ".join(refused.value.__notes__)
+
+
+def test_the_end_of_a_run_restores_the_way_of_stopping_where_the_watch_cannot_be() -> None:
+    network, bus = guarded_cell()
+    with pytest.raises(ObjectAccessError), network:
+        network.prepare()
+        network.guard()
+        bus.nodes[0].aborts[0x1016, 1] = 0x08000022
+        network.unguard()
+        assert reactions(*bus.nodes) == [1, 1]
+
+
+def test_a_second_motion_is_refused_where_the_first_took_the_watch_off() -> None:
+    network, bus = guarded_cell()
+    with network:
+        network.prepare()
+        make_moves(network, stream_of(network, bus))
+        assert network.without_guard() == ("J1", "J2")
+        with pytest.raises(MotionRefused, match="prepare the network again"):
+            make_moves(network, stream_of(network, bus))
+        assert states(bus) == [0x40, 0x40]
+        network.prepare()
+        assert network.without_guard() == ()
+        assert watched(*bus.nodes) == [WATCHES_RECORDER, WATCHES_RECORDER]
+        make_moves(network, stream_of(network, bus))
+    assert watched(*bus.nodes) == [0, 0]
 
 
 def test_an_amplifier_that_never_heard_the_recorder_gets_its_watch_back() -> None:

@@ -13,6 +13,7 @@ import can
 import pytest
 
 from drivers.canopen.network import CanopenNetwork
+from drivers.errors import NodeMisplaced
 from drivers.messages import CellEvent, EventKind, Quantity, SlowReading
 from drivers.motion.execute import execute
 from drivers.move import Move
@@ -243,6 +244,32 @@ def test_a_bus_without_room_is_read_before_and_after_alone(bench: Bench) -> None
         (9, 1, -4.0),
     ]
     assert [(r.time_ns, r.axis, r.value) for r in polling.temperatures(9)] == expected
+
+
+def test_a_misplaced_node_that_is_heard_behind_a_run_costs_no_sample(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Temperatures are read when all samples are there; what cannot be read is missing."""
+    polling = Polling.found(bench.network)
+
+    def fail(timeout: float | None = None) -> can.Message | None:
+        raise NodeMisplaced(9, "A", "B")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(bench.bus, "recv", fail)
+        assert polling.temperatures(0) == ()
+
+
+def test_an_object_that_is_refused_where_the_bus_has_no_room_is_read_after_the_run_alone(
+    bench: Bench,
+) -> None:
+    for index in (0x2005, 0x6077):
+        bench.bus.nodes[0].read_aborts[index, 0] = 0x08000022
+    remarks = Polling.found(bench.network, beside_stream=False).remarks
+    texts = " ".join(remarks)
+    assert "it is asked again after the run" in texts
+    assert "it is not asked again" in texts
+    assert "again in the run" not in texts
 
 
 def test_a_torque_without_rated_torque_has_no_unit_and_is_not_read(bench: Bench) -> None:

@@ -578,6 +578,39 @@ def test_a_reader_that_is_late_loses_nothing(followed: Followed) -> None:
     stream.check()
 
 
+@pytest.mark.parametrize("late_periods", [6, 50, 900])
+def test_a_late_reader_without_stamps_accuses_no_other_master(
+    followed: Followed, late_periods: int
+) -> None:
+    stream, bus, _, events = followed
+    next(stream)
+    for cycle in range(1, late_periods + 1):
+        bus.inject(frame(0x80, b""))
+        for node in bus.nodes:
+            for answer in node.on_sync(cycle):
+                bus.inject(answer)
+    bus.clock.now_ns += late_periods * PERIOD_NS
+    for _ in range(late_periods):
+        stream.advance()
+    assert stream.statistics.missing == 0
+    assert [event for event in events if event.kind is EventKind.BUS_BUSY] == []
+
+
+def test_a_second_producer_is_detected_without_stamps(followed: Followed) -> None:
+    stream, bus, _, events = followed
+    next(stream)
+    for cycle in range(1, 40):
+        bus.clock.now_ns += PERIOD_NS // 2
+        bus.inject(frame(0x80, b""))
+        for node in bus.nodes:
+            for answer in node.on_sync(cycle):
+                bus.inject(answer)
+        stream.advance()
+    assert [event for event in events if event.kind is EventKind.BUS_BUSY] != []
+    with pytest.raises(BusBusy):
+        stream.check()
+
+
 def test_a_sync_that_did_not_come_is_a_period_that_was_left_out(followed: Followed) -> None:
     stream, _, producer, _ = followed
     next(stream)
@@ -862,7 +895,7 @@ def test_jitter_is_no_second_producer(late_ns: list[int]) -> None:
         scheduled_ns = number * PERIOD_NS * 9999 // 10000  # its clock is 100 ppm fast
         at_ns = scheduled_ns + late
         since_last_ns = at_ns - before_ns
-        assert not rate.too_fast(since_last_ns)
+        assert not rate.too_fast(since_last_ns, PERIOD_NS)
         before_ns = at_ns
 
 
