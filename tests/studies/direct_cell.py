@@ -31,7 +31,7 @@ from drivers.canopen.network import CanopenNetwork
 from drivers.canopen.pdo import SETPOINT_PDOS, Direction, records, wanted_pdos, write_pdo_record
 from drivers.canopen.sdo import ObjectAccess
 from drivers.canopen.setup import MODE_OF_OPERATION, PROFILE_POSITION_MODE
-from drivers.messages import CellEvent, EventKind, Sample
+from drivers.messages import CellEvent, EventKind, EventSink, Sample
 from drivers.motion.execute import execute
 from drivers.move import MotionPermission
 from drivers.profiles.profile import ObjectEntry
@@ -176,6 +176,7 @@ class DirectStream:
         network: what the walk asks of a network: its nodes and the names of its axes.
         pacing: of the samples' time.
         silent: never, a node always answers.
+        emit: receives its events, as the walk may replace it; they go to `events`.
         events: in their order.
         time_ns: of the last sample.
         demand_counts: position demand of each sample, with the samples.
@@ -193,6 +194,7 @@ class DirectStream:
         self.bus = self
         self.silent = False
         self.events: list[CellEvent] = []
+        self.emit: EventSink = self.events.append
         self.time_ns = 0
         self.demand_counts: list[tuple[int, ...]] = []
         self._cycle = 0
@@ -243,7 +245,7 @@ class DirectStream:
     def report(self, axis: int | None, kind: EventKind, code: int, text: str) -> None:
         """Keep an event of the walk's."""
         cell_event = CellEvent(self.time_ns, axis, kind, code, text)
-        self.events.append(cell_event)
+        self.emit(cell_event)
 
     def advance(self) -> Sample:
         """One SYNC period, in the order of drivers.simulation.cell.SimulatedCell."""
