@@ -134,6 +134,19 @@ class Host:
         """Return the number of packets that the kernel dropped between two times."""
         return sum(one.dropped(begin_ns, end_ns) for one in self._processors)
 
+    def describe(self, begin_ns: int, end_ns: int) -> str:
+        """Say what the recorder did between two times, by the sum of the ticks in them."""
+        of = {
+            name: sum(one.total(name, begin_ns, end_ns) for one in self._processors)
+            for name in ("ran_ns", "waited_ns", "major_faults", "disk_waits")
+        }
+        milliseconds = 1e-6 * (end_ns - begin_ns)
+        return (
+            f"in {milliseconds:.1f} ms the recorder's busiest thread ran {1e-6 * of['ran_ns']:.1f} "
+            f"ms, its programs waited {1e-6 * of['waited_ns']:.1f} ms for a processor, it read "
+            f"{of['major_faults']} pages from a disk and waited for it at {of['disk_waits']} ticks"
+        )
+
     def starves(self, begin_ns: int, end_ns: int, period_ns: int) -> bool:
         """Return whether the host explains a loss between two times."""
         if self.dropped(begin_ns, end_ns):
@@ -192,9 +205,13 @@ class _Processor:
 
     def dropped(self, begin_ns: int, end_ns: int) -> int:
         """Return the number of packets dropped between two times."""
+        return self.total("dropped", begin_ns, end_ns)
+
+    def total(self, name: str, begin_ns: int, end_ns: int) -> int:
+        """Return the sum of a count over the ticks that touch the time between two times."""
         first = int(np.searchsorted(self._end_ns, begin_ns))
         last = int(np.searchsorted(self._end_ns, end_ns, side="right"))
-        return int(self._columns["dropped"][first : last + 1].sum())
+        return int(self._columns[name][first : last + 1].sum())
 
 
 def judge_losses(
@@ -260,9 +277,14 @@ class _Losses:
         starved = 0
         for at, number in enumerate(self._samples):
             starved += self._starves_around(at)
-            verdict.losses += self._marked(at)
+            losses = self._marked(at)
             if number != last:
-                verdict.losses += self._left_out(number, self._samples[at + 1])
+                losses += self._left_out(number, self._samples[at + 1])
+            verdict.losses += losses
+            if any(loss.cause is Cause.OURS for loss in losses):
+                begin_ns, end_ns = self._window_ns(at)
+                around = self._host.describe(begin_ns, end_ns)
+                verdict.notes.append(f"cycle {self._log.cycle[number]}: {around}")
         verdict.starved_share = starved / len(self._samples)
 
     def _end_of(self, number: int) -> int:

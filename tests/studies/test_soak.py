@@ -333,6 +333,21 @@ def test_the_watch_counts_what_two_busy_programs_take_from_a_third(tmp_path: Pat
     )
     assert {one.cpu for one in ticks} == os.sched_getaffinity(0)
     assert all(one.work_ns > 0 for one in ticks)
+    assert sum(one.ran_ns for one in ticks) > 10**7
+    assert all(one.ran_ns <= 1.1 * one.since_ns + 10**7 for one in ticks)
+
+
+def test_a_loss_of_ours_says_what_the_recorder_did() -> None:
+    """Another loss needs no explanation."""
+    made_scene = scene()
+    made_scene.mark_missing(STRUCK, 1)
+    made_scene.take(STRUCK, ran_ns=2_000_000, major_faults=3, disk_waits=1)
+    (note,) = made_scene.judged().notes
+    assert f"cycle {made_scene.log.cycle[STRUCK]}:" in note
+    assert "ran 2.0 ms" in note
+    assert "read 3 pages from a disk and waited for it at 1 ticks" in note
+    made_scene.take(STRUCK, waited_ns=PERIOD_NS)
+    assert made_scene.judged().notes == []
 
 
 def wait_for(path: Path, done: Callable[[list[Tick]], bool]) -> None:
