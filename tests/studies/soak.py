@@ -17,6 +17,7 @@ from __future__ import annotations
 import argparse
 import csv
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -372,6 +373,8 @@ def soak(bus: ChaosBus, folder: Path, options: argparse.Namespace) -> list[Row]:
                         print_line(f"  ours: cycle {loss.cycle}, {loss.kind.value}")
                 for note in verdict.notes:
                     print_line(f"  {note}")
+                if row.is_ours and options.keep is not None:
+                    shutil.copytree(place.folder, options.keep / f"recording-{len(rows)}")
                 if sum(one.seconds for one in rows) >= 60.0 * minutes:
                     break
     return rows
@@ -386,6 +389,12 @@ def arguments(words: Sequence[str] | None) -> argparse.Namespace:
         "--rates", type=int, nargs="+", default=list(RATES_HZ), metavar="HZ", help="to try"
     )
     parser.add_argument("--results", type=Path, required=True, help="CSV file of the rows")
+    parser.add_argument(
+        "--keep",
+        type=Path,
+        metavar="FOLDER",
+        help="copy the files of a recording with a loss of ours there",
+    )
     parser.add_argument(
         "--hub", action="store_true", help="record over a hub even where there is vcan0"
     )
