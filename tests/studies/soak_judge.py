@@ -379,8 +379,11 @@ class _Losses:
         between = self._frames[self._places[number] + 1 : self._places[following]]
         syncs = sum(frame.identifier == SYNC for frame in between)
         losses = []
-        begin_ns = self._time_ns(number)
         end_ns = self._time_ns(following)
+        # A SYNC that is sent late has a time behind that at which the next ones were due: what held
+        # it up is between its own due time and its frame.
+        due_ns = end_ns - (gap + 1) * self._period_ns
+        begin_ns = min(self._time_ns(number), due_ns)
         cause = Cause.OURS
         if self._host.starves(begin_ns, end_ns, self._period_ns):
             cause = Cause.HOST

@@ -182,6 +182,24 @@ def no_sync_while_starved(made_scene: Scene) -> None:
     no_sync(made_scene)
 
 
+def no_sync_behind_a_late_one(made_scene: Scene) -> None:
+    """A SYNC comes at the end of a wait, and the next one, due in the wait, is left out.
+
+    The wait is over before the frames between which the SYNC is missing.
+    """
+    made_scene.take(STRUCK - 1, waited_ns=PERIOD_NS)
+    no_sync_behind_one_sent_late(made_scene)
+
+
+def no_sync_behind_one_sent_late(made_scene: Scene) -> None:
+    """As before, but nothing was taken: the sender held both up itself."""
+    late_ns = made_scene.sync_ns(STRUCK) + PERIOD_NS * 9 // 10
+    before = made_scene.bus[FIRST + STRUCK - 1]
+    made_scene.log.time_ns[STRUCK - 1] = START_NS + late_ns - made_scene.sync_ns(0)
+    made_scene.bus[FIRST + STRUCK - 1] = [frame._replace(time_ns=late_ns) for frame in before]
+    no_sync(made_scene)
+
+
 def sync_too_late(made_scene: Scene) -> None:
     """SYNC comes just before the next one, so that no axis can answer in time."""
     late_ns = made_scene.sync_ns(STRUCK + 1) - PERIOD_NS // 10
@@ -236,6 +254,8 @@ PLANTED: tuple[tuple[Callable[[Scene], None], int, int, dict[LossKind, int]], ..
     (unread_with_early_wait, 1, 0, {LossKind.UNREAD: 1}),
     (no_sync, AXES, 0, {LossKind.NO_SYNC: AXES}),
     (no_sync_while_starved, 0, AXES, {LossKind.NO_SYNC: AXES}),
+    (no_sync_behind_a_late_one, 0, AXES, {LossKind.NO_SYNC: AXES}),
+    (no_sync_behind_one_sent_late, AXES, 0, {LossKind.NO_SYNC: AXES}),
     (sync_too_late, AXES, 0, {LossKind.LATE: AXES}),
     (counted_but_on_the_bus, AXES, 0, {LossKind.UNREAD: AXES}),
     (uncounted, AXES, 0, {LossKind.UNCOUNTED: AXES}),
